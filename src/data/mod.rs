@@ -1,0 +1,60 @@
+//! Where frames come from: the embedded street, KITTI raw, folders; and what is done to them before training.
+
+use std::sync::Arc;
+
+use image::RgbImage;
+
+use crate::Result;
+
+/// Pinhole intrinsics in units of the image size, so that they hold at any resolution:
+/// `u = fx * W * x/z + cx * W`, `v = fy * H * y/z + cy * H`, pixel centres at whole numbers.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Intrinsics {
+    /// Focal length over the width.
+    pub fx: f64,
+    /// Focal length over the height.
+    pub fy: f64,
+    /// Principal point over the width.
+    pub cx: f64,
+    /// Principal point over the height.
+    pub cy: f64,
+}
+
+impl Intrinsics {
+    /// The published constants for KITTI: fx 0.58 W, fy 1.92 H, the centre in the middle.
+    pub const KITTI: Intrinsics = Intrinsics { fx: 0.58, fy: 1.92, cx: 0.5, cy: 0.5 };
+}
+
+/// A map of metric depth (camera z, metres), row-major, 0 where nothing is known.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DepthMap {
+    /// Width in pixels.
+    pub width: usize,
+    /// Height in pixels.
+    pub height: usize,
+    /// `height * width` depths in metres; 0 means unknown.
+    pub metres: Vec<f32>,
+}
+
+/// Samples for training and evaluation: each a target frame with its neighbours in time.
+pub trait Dataset: Send + Sync {
+    /// How many samples there are.
+    fn len(&self) -> usize;
+
+    /// Whether there is none.
+    fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// A name for messages: drive and frame.
+    fn name(&self, sample: usize) -> String;
+
+    /// The frame at `offset` (-1 previous, 0 target, +1 next) of a sample, at the size the networks see.
+    fn image(&self, sample: usize, offset: i32) -> Result<Arc<RgbImage>>;
+
+    /// The camera of a sample.
+    fn intrinsics(&self, sample: usize) -> Intrinsics;
+
+    /// Ground-truth depth of the target frame at its own size, where there is one.
+    fn depth(&self, sample: usize) -> Result<Option<DepthMap>>;
+}

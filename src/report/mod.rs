@@ -1,0 +1,1 @@
+//! Colour maps, plots, and what a run leaves behind.
