@@ -3,7 +3,11 @@
 #![deny(unsafe_code)]
 
 pub mod data;
-pub mod report;
 mod error;
+pub mod gradcheck;
+pub mod ops;
+pub mod random;
+pub mod report;
+pub mod tensor;
 
 pub use error::{Error, Result};

@@ -1,0 +1,165 @@
+//! Gradient-check cases: an op, its attributes, and what its inputs are filled with.
+
+use crate::random::Random;
+use crate::tensor::{Shape, Tensor};
+
+/// The largest error that a smooth op may show: |analytic - numeric| / max |analytic|, per input, in f64.
+pub const TOLERANCE: f64 = 1e-7;
+
+/// One input of a case.
+#[derive(Clone, Debug)]
+pub struct Input {
+    /// Its name in reports.
+    pub name: &'static str,
+    /// Its shape.
+    pub shape: Shape,
+    /// What it is filled with.
+    pub fill: Fill,
+    /// Why it is not differentiated, if so.
+    pub constant: Option<&'static str>,
+}
+
+/// What an input is filled with.
+#[derive(Clone, Debug)]
+pub enum Fill {
+    /// Uniform random numbers.
+    Uniform {
+        /// The least.
+        low: f64,
+        /// The greatest.
+        high: f64,
+    },
+    /// Uniform random numbers that keep a distance from given points (kinks).
+    Away {
+        /// The least.
+        low: f64,
+        /// The greatest.
+        high: f64,
+        /// Where the function has no derivative.
+        kinks: Vec<f64>,
+        /// How far to stay away.
+        margin: f64,
+    },
+    /// Evenly spaced different numbers in random order: no ties, and none nearly so.
+    Distinct {
+        /// The least.
+        low: f64,
+        /// The greatest.
+        high: f64,
+    },
+    /// These numbers.
+    Values(Vec<f64>),
+}
+
+impl Input {
+    fn new(name: &'static str, shape: impl Into<Shape>, fill: Fill) -> Self {
+        Input { name, shape: shape.into(), fill, constant: None }
+    }
+
+    /// Uniform random numbers in [-1, 1].
+    pub fn random(name: &'static str, shape: impl Into<Shape>) -> Self {
+        Self::uniform(name, shape, -1.0, 1.0)
+    }
+
+    /// Uniform random numbers.
+    pub fn uniform(name: &'static str, shape: impl Into<Shape>, low: f64, high: f64) -> Self {
+        Self::new(name, shape, Fill::Uniform { low, high })
+    }
+
+    /// Uniform random numbers in [low, high] at least 0.01 from the given points, where the function has kinks.
+    pub fn away(name: &'static str, shape: impl Into<Shape>, low: f64, high: f64, kinks: &[f64]) -> Self {
+        Self::new(name, shape, Fill::Away { low, high, kinks: kinks.to_vec(), margin: 0.01 })
+    }
+
+    /// Different numbers in [-1, 1], evenly spaced, in random order: for ops that compare.
+    pub fn distinct(name: &'static str, shape: impl Into<Shape>) -> Self {
+        Self::new(name, shape, Fill::Distinct { low: -1.0, high: 1.0 })
+    }
+
+    /// Given numbers.
+    ///
+    /// # Panics
+    /// If their number is not that of the shape.
+    #[track_caller]
+    pub fn values(name: &'static str, shape: impl Into<Shape>, values: impl Into<Vec<f64>>) -> Self {
+        let (shape, values) = (shape.into(), values.into());
+        assert_eq!(shape.len(), values.len(), "input {name}");
+        Self::new(name, shape, Fill::Values(values))
+    }
+
+    /// The same input, declared not differentiable, with the reason.
+    pub fn constant(mut self, reason: &'static str) -> Self {
+        self.constant = Some(reason);
+        self
+    }
+
+    /// Draws the numbers.
+    pub fn draw(&self, random: &mut Random) -> Tensor<f64> {
+        let n = self.shape.len();
+        let numbers = match &self.fill {
+            Fill::Uniform { low, high } => (0..n).map(|_| random.uniform(*low, *high)).collect(),
+            Fill::Away { low, high, kinks, margin } => (0..n)
+                .map(|_| {
+                    loop {
+                        let x = random.uniform(*low, *high);
+                        if kinks.iter().all(|k| (x - k).abs() > *margin) {
+                            return x;
+                        }
+                    }
+                })
+                .collect(),
+            Fill::Distinct { low, high } => {
+                let mut all: Vec<f64> = (0..n).map(|i| low + (high - low) * (i as f64 + 0.5) / n as f64).collect();
+                random.shuffle(&mut all);
+                all
+            }
+            Fill::Values(values) => values.clone(),
+        };
+        Tensor::from_vec(self.shape, numbers)
+    }
+}
+
+/// An op with attributes and inputs on which its gradient is compared with finite differences.
+#[derive(Clone, Debug)]
+pub struct Case<O> {
+    /// What is special about it.
+    pub name: &'static str,
+    /// The op.
+    pub op: O,
+    /// Its inputs.
+    pub inputs: Vec<Input>,
+    /// The largest error allowed.
+    pub tolerance: f64,
+    /// Why the tolerance is looser than [`TOLERANCE`], if it is.
+    pub reason: Option<&'static str>,
+    /// How many elements sit exactly on a kink, where only the documented one-sided value can be asked for.
+    pub kinks: usize,
+    /// Whether all gradients are zero here, and rightly so.
+    pub flat: bool,
+}
+
+impl<O> Case<O> {
+    /// A case at the usual tolerance.
+    pub fn new(name: &'static str, op: O, inputs: impl Into<Vec<Input>>) -> Self {
+        Case { name, op, inputs: inputs.into(), tolerance: TOLERANCE, reason: None, kinks: 0, flat: false }
+    }
+
+    /// Allows a larger error, for a reason that is printed.
+    pub fn tolerance(mut self, tolerance: f64, reason: &'static str) -> Self {
+        self.tolerance = tolerance;
+        self.reason = Some(reason);
+        self
+    }
+
+    /// Says that this many elements sit on a kink.
+    pub fn kinks(mut self, count: usize) -> Self {
+        self.kinks = count;
+        self
+    }
+
+    /// Says that every gradient is rightly zero here (an empty input, a saturated clamp).
+    pub fn flat(mut self) -> Self {
+        self.flat = true;
+        self
+    }
+}

@@ -1,0 +1,180 @@
+//! The linear layer: one GEMM over all the rows of the batch.
+
+use super::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::tensor::gemm::{Rows, RowsMut, gemm};
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
+
+/// `y [.., out] = x [.., in] w [in, out] (+ b [out])`. A 1x1 convolution is the same thing.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Linear {
+    /// Rows handed to a thread at a time; chosen by shape if 0. A gradient check shrinks it to reach tile edges.
+    pub tile: usize,
+}
+
+impl Linear {
+    /// Rows a tile: about 2^17 multiplications, at least 32 rows.
+    fn tile(&self, k: usize, n: usize) -> usize {
+        if self.tile > 0 { self.tile } else { ((1 << 17) / (k * n).max(1)).clamp(32, 1024) }
+    }
+}
+
+/// How many partial sums a weight gradient is made of: depends on the shape alone.
+fn partials(rows: usize) -> usize {
+    rows.div_ceil(256).clamp(1, 8)
+}
+
+impl<T: Float> Op<T> for Linear {
+    /// The rows x, the weight, and whether there is a bias.
+    type Saved = (Option<Tensor<T>>, Option<Tensor<T>>);
+
+    fn shape(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError> {
+        let (x, w) = (inputs[0], inputs[1].dims());
+        if x.rank() == 0 || w.len() != 2 || w[0] != x.last() {
+            return Err(ShapeError::new("expected x [.., in] and w [in, out]"));
+        }
+        if inputs.get(2).is_some_and(|b| b.dims() != [w[1]]) {
+            return Err(ShapeError::new("expected b [out]"));
+        }
+        Ok(vec![x.with(x.rank() - 1, w[1])])
+    }
+
+    fn algo(&self, inputs: &[Shape]) -> &'static str {
+        if inputs.len() > 2 { "bias" } else { "no_bias" }
+    }
+
+    fn flops(&self, inputs: &[Shape]) -> u64 {
+        2 * (inputs[0].rows() * inputs[1].len()) as u64
+    }
+
+    fn forward(&self, inputs: &[&Tensor<T>], needs: &Needs) -> (Vec<Tensor<T>>, Self::Saved) {
+        let (x, w, b) = (inputs[0], inputs[1], inputs.get(2));
+        let [k, n] = [w.dims()[0], w.dims()[1]];
+        let shape = x.shape().with(x.shape().rank() - 1, n);
+        let tile = self.tile(k, n);
+        let y = Tensor::build(shape, |out| {
+            let work = 2 * out.len() * k;
+            parallel::for_each_chunk(out, tile * n, work, |i, out| {
+                let rows = out.len() / n;
+                let x = Rows::dense(&x.data()[i * tile * k..][..rows * k], rows, k);
+                let mut accum = Accum::Replace;
+                if let Some(b) = b {
+                    out.chunks_exact_mut(n).for_each(|row| row.copy_from_slice(b.data()));
+                    accum = Accum::Add;
+                }
+                gemm(RowsMut::dense(out, rows, n), accum, x, Rows::dense(w.data(), k, n), T::ONE);
+            });
+        });
+        (vec![y], (needs.get(1).then(|| x.clone()), needs.get(0).then(|| w.clone())))
+    }
+
+    /// dx = dy w^T, dw = x^T dy, db = the sum of dy's rows.
+    fn backward(&self, (x, w): Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
+        let g = upstream.only();
+        let (rows, n) = (g.shape().rows(), g.shape().last());
+        if let Some(w) = w {
+            let k = w.dims()[0];
+            let tile = self.tile(k, n);
+            sink.accumulate(0, |out, accum| {
+                let work = 2 * g.len() * k;
+                parallel::for_each_chunk(out, tile * k, work, |i, out| {
+                    let rows = out.len() / k;
+                    let g = Rows::dense(&g.data()[i * tile * n..][..rows * n], rows, n);
+                    gemm(RowsMut::dense(out, rows, k), accum, g, Rows::dense(w.data(), k, n).t(), T::ONE);
+                });
+            });
+        }
+        if let Some(x) = x {
+            let k = x.shape().last();
+            sink.accumulate(1, |out, accum| {
+                weight_gradient(out, accum, Rows::dense(x.data(), rows, k), Rows::dense(g.data(), rows, n));
+            });
+        }
+        sink.accumulate(2, |out, accum| bias_gradient(out, accum, g.data()));
+    }
+}
+
+/// `dw = x^T dy` in a fixed number of partial sums, added up in order: the same bits for any number of threads.
+pub(crate) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, x: Rows<T>, g: Rows<T>) {
+    let (rows, k, n) = (x.rows, x.cols, g.cols);
+    let parts = partials(rows);
+    let step = rows.div_ceil(parts).max(1);
+    let product = |part: usize, out: &mut [T], accum| {
+        let (from, to) = ((part * step).min(rows), ((part + 1) * step).min(rows));
+        let cut = |m: Rows<'_, T>| -> (usize, usize) { (from * m.row_stride, to - from) };
+        let ((xi, count), (gi, _)) = (cut(x), cut(g));
+        let x = Rows { data: if count == 0 { &[] } else { &x.data[xi..] }, rows: count, ..x };
+        let g = Rows { data: if count == 0 { &[] } else { &g.data[gi..] }, rows: count, ..g };
+        gemm(RowsMut::dense(out, k, n), accum, x.t(), g, T::ONE);
+    };
+    if parts == 1 {
+        return product(0, out, accum);
+    }
+    let sums =
+        parallel::map(parts, 2 * rows * k * n, |part| Tensor::build([k, n], |out| product(part, out, Accum::Replace)));
+    sum_into(out, accum, &sums);
+}
+
+/// Adds up partial sums in order.
+pub(crate) fn sum_into<T: Float>(out: &mut [T], accum: Accum, parts: &[Tensor<T>]) {
+    let mut parts = parts.iter();
+    if accum == Accum::Replace {
+        match parts.next() {
+            Some(first) => out.copy_from_slice(first.data()),
+            None => out.fill(T::ZERO),
+        }
+    }
+    for part in parts {
+        out.iter_mut().zip(part.data()).for_each(|(s, &x)| *s += x);
+    }
+}
+
+/// The sum of the rows of `g`, in blocks: the same bits for any number of threads.
+pub(crate) fn bias_gradient<T: Float>(out: &mut [T], accum: Accum, g: &[T]) {
+    let n = out.len();
+    if n == 0 {
+        return;
+    }
+    const BLOCK: usize = 256;
+    let rows = g.len() / n;
+    let blocks = parallel::map(rows.div_ceil(BLOCK), g.len(), |i| {
+        let rows = &g[i * BLOCK * n..((i + 1) * BLOCK).min(rows) * n];
+        Tensor::build([n], |sum| {
+            sum.fill(T::ZERO);
+            for row in rows.chunks_exact(n) {
+                sum.iter_mut().zip(row).for_each(|(s, &g)| *s += g);
+            }
+        })
+    });
+    sum_into(out, accum, &blocks);
+}
+
+impl Checked for Linear {
+    fn cases() -> Vec<Case<Self>> {
+        let x = |shape: &[usize]| Input::random("x", shape);
+        let w = |k: usize, n: usize| Input::random("w", [k, n]);
+        let b = |n: usize| Input::random("b", [n]);
+        let tiled = |tile| Linear { tile };
+        vec![
+            Case::new("with bias", tiled(0), [x(&[2, 3, 5]), w(5, 4), b(4)]),
+            Case::new("without bias", tiled(0), [x(&[2, 3, 5]), w(5, 4)]),
+            Case::new("a vector", tiled(0), [x(&[5]), w(5, 4), b(4)]),
+            Case::new("tile less one", tiled(4), [x(&[3, 5]), w(5, 2), b(2)]),
+            Case::new("a whole tile", tiled(4), [x(&[4, 5]), w(5, 2), b(2)]),
+            Case::new("tile and one", tiled(4), [x(&[5, 5]), w(5, 2), b(2)]),
+            Case::new("partial sums", tiled(0), [x(&[300, 2]), w(2, 3), b(3)]),
+            Case::new("partial sums without bias", tiled(0), [x(&[300, 2]), w(2, 3)]),
+            Case::new("no rows", tiled(0), [x(&[0, 2]), w(2, 3), b(3)]).flat(),
+        ]
+    }
+}
+
+impl<T: Float> Var<T> {
+    /// `x [.., in] w [in, out] (+ b [out])`.
+    #[track_caller]
+    pub fn linear(&self, weight: &Self, bias: Option<&Self>) -> Self {
+        match bias {
+            Some(bias) => apply1(Linear::default(), &[self, weight, bias]),
+            None => apply1(Linear::default(), &[self, weight]),
+        }
+    }
+}

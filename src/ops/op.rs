@@ -1,0 +1,99 @@
+//! What an op is.
+
+use std::fmt;
+
+use super::case::Case;
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream};
+
+/// A differentiable function of tensors: its shape rule, its forward pass, its gradient, and (by [`Checked`]) the
+/// cases that prove the gradient, side by side in one file.
+///
+/// An op is a small struct that holds its attributes (stride, axis, eps). It gets plain [`Tensor`]s, so that a backward
+/// rule cannot record by accident. Optional inputs (a bias) come last: `inputs.get(2)`.
+pub trait Op<T: Float>: Registered + Checked + Clone + 'static {
+    /// What the backward pass needs.
+    type Saved: 'static;
+
+    /// The shapes of the outputs, or why the inputs do not fit.
+    fn shape(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError>;
+
+    /// How many of the outputs, at the end, are results that nobody differentiates (batch statistics, an index).
+    fn auxiliary(&self) -> usize {
+        0
+    }
+
+    /// The kernel path that these inputs take: coverage tells fast paths apart by it.
+    fn algo(&self, inputs: &[Shape]) -> &'static str {
+        let _ = inputs;
+        "direct"
+    }
+
+    /// Multiplications and additions (counted as two) of the forward pass; 0 where it is not a matter of arithmetic.
+    fn flops(&self, inputs: &[Shape]) -> u64 {
+        let _ = inputs;
+        0
+    }
+
+    /// Computes the outputs, and what the backward pass needs of those inputs whose gradient somebody wants.
+    fn forward(&self, inputs: &[&Tensor<T>], needs: &Needs) -> (Vec<Tensor<T>>, Self::Saved);
+
+    /// Turns the gradients of the outputs into those of the inputs.
+    fn backward(&self, saved: Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>);
+}
+
+/// An op that is in the registry, under its name there; or a [`CustomOp`].
+pub trait Registered {
+    /// The name, in snake case.
+    const NAME: &'static str;
+}
+
+/// An op from outside this crate. It has the same duties: cases are required.
+pub trait CustomOp {
+    /// The name, in snake case.
+    const NAME: &'static str;
+}
+
+impl<O: CustomOp> Registered for O {
+    const NAME: &'static str = <O as CustomOp>::NAME;
+}
+
+/// An op with gradient-check cases. There is no default: an op without cases does not build.
+pub trait Checked: Sized {
+    /// Inputs on which the gradient is compared with finite differences: every kernel path, every input perturbed.
+    fn cases() -> Vec<Case<Self>>;
+}
+
+/// Which inputs' gradients somebody wants. Reaches the forward pass, so that inference and frozen parts save nothing.
+#[derive(Clone, Debug)]
+pub struct Needs(pub(crate) Vec<bool>);
+
+impl Needs {
+    /// Whether the gradient of input `i` is wanted (an absent optional input's is not).
+    pub fn get(&self, i: usize) -> bool {
+        self.0.get(i).copied().unwrap_or(false)
+    }
+
+    /// Whether any is wanted: whether there will be a backward pass.
+    pub fn any(&self) -> bool {
+        self.0.contains(&true)
+    }
+}
+
+/// Why inputs do not fit an op.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ShapeError(pub String);
+
+impl ShapeError {
+    /// An error with a message; the op's name and the shapes are added by `apply`.
+    pub fn new(message: impl Into<String>) -> Self {
+        ShapeError(message.into())
+    }
+}
+
+impl fmt::Display for ShapeError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for ShapeError {}

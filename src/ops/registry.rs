@@ -1,0 +1,135 @@
+//! The registry: every op of this crate, by name. One line each; what is not here does not build.
+
+use super::case::{Case, Input};
+use super::op::{Op, Registered};
+use super::*;
+use crate::tensor::{Shape, Var};
+
+/// Makes the list of all ops and, in the same breath, lets each of them be an [`Op`].
+macro_rules! registry {
+    ($($name:literal => $op:ty),* $(,)?) => {
+        $(impl Registered for $op {
+            const NAME: &'static str = $name;
+        })*
+
+        /// Every op of this crate.
+        pub fn all() -> Vec<Entry> {
+            vec![$(Entry::of::<$op>()),*]
+        }
+    };
+}
+
+registry! {
+    "relu" => unary::Unary<unary::Relu>,
+    "elu" => unary::Unary<unary::Elu>,
+    "gelu" => unary::Unary<unary::Gelu>,
+    "hardswish" => unary::Unary<unary::Hardswish>,
+    "sigmoid" => unary::Unary<unary::Sigmoid>,
+    "tanh" => unary::Unary<unary::Tanh>,
+    "exp" => unary::Unary<unary::Exp>,
+    "log" => unary::Unary<unary::Log>,
+    "sqrt" => unary::Unary<unary::Sqrt>,
+    "abs" => unary::Unary<unary::Abs>,
+    "reciprocal" => unary::Unary<unary::Reciprocal>,
+    "square" => unary::Unary<unary::Square>,
+    "clamp" => unary::Unary<unary::Clamp>,
+    "affine" => unary::Unary<unary::Affine>,
+    "add" => binary::Binary<binary::Add>,
+    "sub" => binary::Binary<binary::Sub>,
+    "mul" => binary::Binary<binary::Mul>,
+    "div" => binary::Binary<binary::Div>,
+    "maximum" => binary::Binary<binary::Maximum>,
+    "minimum" => binary::Binary<binary::Minimum>,
+    "sum" => reduce::Sum,
+    "max" => reduce::Extreme<reduce::Max>,
+    "min" => reduce::Extreme<reduce::Min>,
+    "reshape" => shape_ops::Reshape,
+    "permute" => shape_ops::Permute,
+    "matmul" => matmul::Matmul,
+    "linear" => linear::Linear,
+}
+
+/// One op as the suite sees it.
+pub struct Entry {
+    /// The name.
+    pub name: &'static str,
+    cases: fn() -> Vec<Box<dyn AnyCase>>,
+}
+
+impl Entry {
+    /// An op, of this crate or a [`CustomOp`].
+    pub fn of<O: Op<f64> + Op<f32>>() -> Self {
+        Entry {
+            name: O::NAME,
+            cases: || O::cases().into_iter().map(|case| Box::new(case) as Box<dyn AnyCase>).collect(),
+        }
+    }
+
+    /// Its gradient-check cases.
+    pub fn cases(&self) -> Vec<Box<dyn AnyCase>> {
+        (self.cases)()
+    }
+}
+
+/// A case of any op.
+pub trait AnyCase {
+    /// The op's name.
+    fn op(&self) -> &'static str;
+    /// The case's name.
+    fn name(&self) -> &'static str;
+    /// The kernel path it takes.
+    fn algo(&self) -> &'static str;
+    /// Its inputs.
+    fn inputs(&self) -> &[Input];
+    /// The largest error allowed.
+    fn tolerance(&self) -> f64;
+    /// Why that is more than usual.
+    fn reason(&self) -> Option<&'static str>;
+    /// How many elements sit on a kink.
+    fn kinks(&self) -> usize;
+    /// Whether every gradient is rightly zero.
+    fn flat(&self) -> bool;
+    /// How many of the outputs, at the end, are not differentiated.
+    fn auxiliary(&self) -> usize;
+    /// Runs the op in f64.
+    fn run(&self, inputs: &[&Var<f64>]) -> Vec<Var<f64>>;
+    /// Runs the op in f32.
+    fn run_f32(&self, inputs: &[&Var<f32>]) -> Vec<Var<f32>>;
+}
+
+impl<O: Op<f64> + Op<f32>> AnyCase for Case<O> {
+    fn op(&self) -> &'static str {
+        O::NAME
+    }
+    fn name(&self) -> &'static str {
+        self.name
+    }
+    fn algo(&self) -> &'static str {
+        let shapes: Vec<Shape> = self.inputs.iter().map(|i| i.shape).collect();
+        Op::<f64>::algo(&self.op, &shapes)
+    }
+    fn inputs(&self) -> &[Input] {
+        &self.inputs
+    }
+    fn tolerance(&self) -> f64 {
+        self.tolerance
+    }
+    fn reason(&self) -> Option<&'static str> {
+        self.reason
+    }
+    fn kinks(&self) -> usize {
+        self.kinks
+    }
+    fn flat(&self) -> bool {
+        self.flat
+    }
+    fn auxiliary(&self) -> usize {
+        Op::<f64>::auxiliary(&self.op)
+    }
+    fn run(&self, inputs: &[&Var<f64>]) -> Vec<Var<f64>> {
+        apply(self.op.clone(), inputs)
+    }
+    fn run_f32(&self, inputs: &[&Var<f32>]) -> Vec<Var<f32>> {
+        apply(self.op.clone(), inputs)
+    }
+}

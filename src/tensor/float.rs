@@ -1,0 +1,336 @@
+//! The two element types: `f32` to train in, `f64` to check in.
+
+use std::fmt::{Debug, Display};
+use std::iter::Sum;
+use std::ops::{Add, AddAssign, Div, DivAssign, Mul, MulAssign, Neg, Sub, SubAssign};
+
+use super::gemm::Gemm;
+use super::pool::Pool;
+
+mod sealed {
+    pub trait Sealed {}
+    impl Sealed for f32 {}
+    impl Sealed for f64 {}
+}
+
+/// `f32` or `f64`: what a tensor holds. Sealed, so that every kernel is checked for every type it runs in.
+///
+/// [`max`](Float::max) and [`min`](Float::min) propagate NaN, unlike the standard library's.
+pub trait Float:
+    sealed::Sealed
+    + Gemm
+    + Copy
+    + Debug
+    + Display
+    + Default
+    + PartialOrd
+    + Add<Output = Self>
+    + Sub<Output = Self>
+    + Mul<Output = Self>
+    + Div<Output = Self>
+    + Neg<Output = Self>
+    + AddAssign
+    + SubAssign
+    + MulAssign
+    + DivAssign
+    + Sum
+    + Send
+    + Sync
+    + 'static
+{
+    /// 0.
+    const ZERO: Self;
+    /// 1.
+    const ONE: Self;
+    /// Not a number.
+    const NAN: Self;
+    /// Positive infinity.
+    const INFINITY: Self;
+    /// The distance from 1 to the next number.
+    const EPSILON: Self;
+
+    /// The nearest value of this type.
+    fn of(x: f64) -> Self;
+    /// The value as `f64`, exactly.
+    fn f64(self) -> f64;
+    /// `self * a + b` with one rounding.
+    fn mul_add(self, a: Self, b: Self) -> Self;
+    /// e to this power. In `f32` a branch-free polynomial that vectorises, within 2 units in the last place.
+    fn exp(self) -> Self;
+    /// The natural logarithm.
+    fn ln(self) -> Self;
+    /// The square root.
+    fn sqrt(self) -> Self;
+    /// The sine.
+    fn sin(self) -> Self;
+    /// The cosine.
+    fn cos(self) -> Self;
+    /// The hyperbolic tangent.
+    fn tanh(self) -> Self;
+    /// The Gauss error function.
+    fn erf(self) -> Self;
+    /// The absolute value.
+    fn abs(self) -> Self;
+    /// The largest whole number that is not above.
+    fn floor(self) -> Self;
+    /// Whether it is neither infinite nor NaN.
+    fn is_finite(self) -> bool;
+    /// Whether it is NaN.
+    fn is_nan(self) -> bool;
+    /// The bits, widened: equal only for the same bits (NaN equals itself, 0 differs from -0).
+    fn bits(self) -> u64;
+    #[doc(hidden)]
+    fn pool() -> &'static Pool<Self>;
+
+    /// The larger of two; NaN if either is.
+    #[inline(always)]
+    fn max(self, other: Self) -> Self {
+        if self > other || self.is_nan() { self } else { other }
+    }
+
+    /// The smaller of two; NaN if either is.
+    #[inline(always)]
+    fn min(self, other: Self) -> Self {
+        if self < other || self.is_nan() { self } else { other }
+    }
+
+    /// 1 / (1 + exp(-x)), without overflow at either end.
+    #[inline(always)]
+    fn sigmoid(self) -> Self {
+        let e = (-self.abs()).exp();
+        let positive = Self::ONE / (Self::ONE + e);
+        if self >= Self::ZERO { positive } else { e * positive }
+    }
+}
+
+impl Float for f32 {
+    const ZERO: f32 = 0.0;
+    const ONE: f32 = 1.0;
+    const NAN: f32 = f32::NAN;
+    const INFINITY: f32 = f32::INFINITY;
+    const EPSILON: f32 = f32::EPSILON;
+
+    #[inline(always)]
+    fn of(x: f64) -> f32 {
+        x as f32
+    }
+    #[inline(always)]
+    fn f64(self) -> f64 {
+        self as f64
+    }
+    #[inline(always)]
+    fn mul_add(self, a: f32, b: f32) -> f32 {
+        f32::mul_add(self, a, b)
+    }
+
+    /// x = n ln 2 + r with |r| <= ln 2 / 2, so that e^x = 2^n e^r, and e^r by a polynomial of degree 6.
+    ///
+    /// 2^n is applied in two halves, which lets the result fall into the subnormals and to 0 by itself.
+    #[inline(always)]
+    fn exp(self) -> f32 {
+        // Adding 1.5 * 2^23 leaves the nearest whole number in the low bits of the mantissa.
+        const MAGIC: f32 = 12_582_912.0;
+        // Beyond these the result is 0 or infinite anyway; NaN passes through both comparisons.
+        let x = if self > 89.0 { 89.0 } else { self };
+        let x = if x < -104.0 { -104.0 } else { x };
+        let shifted = x.mul_add(std::f32::consts::LOG2_E, MAGIC);
+        let n = shifted - MAGIC;
+        // ln 2 in two parts, the first with few enough bits that n times it is exact.
+        let r = n.mul_add(-0.693_359_4, x);
+        let r = n.mul_add(2.121_944_4e-4, r);
+        let p = r.mul_add(1.0 / 720.0, 1.0 / 120.0);
+        let p = p.mul_add(r, 1.0 / 24.0);
+        let p = p.mul_add(r, 1.0 / 6.0);
+        let p = p.mul_add(r, 0.5);
+        let p = p.mul_add(r, 1.0);
+        let p = p.mul_add(r, 1.0);
+        let n = shifted.to_bits().wrapping_sub(MAGIC.to_bits()) as i32;
+        let half = n >> 1;
+        let scale = |k: i32| f32::from_bits((k.wrapping_add(127) as u32) << 23);
+        p * scale(half) * scale(n.wrapping_sub(half))
+    }
+    #[inline(always)]
+    fn ln(self) -> f32 {
+        f32::ln(self)
+    }
+    #[inline(always)]
+    fn sqrt(self) -> f32 {
+        f32::sqrt(self)
+    }
+    #[inline(always)]
+    fn sin(self) -> f32 {
+        f32::sin(self)
+    }
+    #[inline(always)]
+    fn cos(self) -> f32 {
+        f32::cos(self)
+    }
+    #[inline(always)]
+    fn tanh(self) -> f32 {
+        f32::tanh(self)
+    }
+
+    /// An odd rational function on [-4, 4], beyond which the result is 1 to the last place; vectorises.
+    #[inline(always)]
+    fn erf(self) -> f32 {
+        let x = if self > 4.0 { 4.0 } else { self };
+        let x = if x < -4.0 { -4.0 } else { x };
+        let s = x * x;
+        let p = s.mul_add(-2.726_142_3e-10, 2.770_681_4e-8);
+        let p = p.mul_add(s, -2.101_024e-6);
+        let p = p.mul_add(s, -5.692_506_4e-5);
+        let p = p.mul_add(s, -7.349_906_3e-4);
+        let p = p.mul_add(s, -2.954_6e-3);
+        let p = p.mul_add(s, -1.609_603_3e-2);
+        let q = s.mul_add(-1.456_607_2e-5, -2.133_740_6e-4);
+        let q = q.mul_add(s, -1.682_827e-3);
+        let q = q.mul_add(s, -7.373_329e-3);
+        let q = q.mul_add(s, -1.426_473_9e-2);
+        x * p / q
+    }
+    #[inline(always)]
+    fn abs(self) -> f32 {
+        f32::abs(self)
+    }
+    #[inline(always)]
+    fn floor(self) -> f32 {
+        f32::floor(self)
+    }
+    #[inline(always)]
+    fn is_finite(self) -> bool {
+        f32::is_finite(self)
+    }
+    #[inline(always)]
+    fn is_nan(self) -> bool {
+        f32::is_nan(self)
+    }
+    #[inline(always)]
+    fn bits(self) -> u64 {
+        self.to_bits() as u64
+    }
+    fn pool() -> &'static Pool<f32> {
+        static POOL: Pool<f32> = Pool::new();
+        &POOL
+    }
+}
+
+impl Float for f64 {
+    const ZERO: f64 = 0.0;
+    const ONE: f64 = 1.0;
+    const NAN: f64 = f64::NAN;
+    const INFINITY: f64 = f64::INFINITY;
+    const EPSILON: f64 = f64::EPSILON;
+
+    #[inline(always)]
+    fn of(x: f64) -> f64 {
+        x
+    }
+    #[inline(always)]
+    fn f64(self) -> f64 {
+        self
+    }
+    #[inline(always)]
+    fn mul_add(self, a: f64, b: f64) -> f64 {
+        f64::mul_add(self, a, b)
+    }
+    #[inline(always)]
+    fn exp(self) -> f64 {
+        f64::exp(self)
+    }
+    #[inline(always)]
+    fn ln(self) -> f64 {
+        f64::ln(self)
+    }
+    #[inline(always)]
+    fn sqrt(self) -> f64 {
+        f64::sqrt(self)
+    }
+    #[inline(always)]
+    fn sin(self) -> f64 {
+        f64::sin(self)
+    }
+    #[inline(always)]
+    fn cos(self) -> f64 {
+        f64::cos(self)
+    }
+    #[inline(always)]
+    fn tanh(self) -> f64 {
+        f64::tanh(self)
+    }
+    #[inline(always)]
+    fn erf(self) -> f64 {
+        libm::erf(self)
+    }
+    #[inline(always)]
+    fn abs(self) -> f64 {
+        f64::abs(self)
+    }
+    #[inline(always)]
+    fn floor(self) -> f64 {
+        f64::floor(self)
+    }
+    #[inline(always)]
+    fn is_finite(self) -> bool {
+        f64::is_finite(self)
+    }
+    #[inline(always)]
+    fn is_nan(self) -> bool {
+        f64::is_nan(self)
+    }
+    #[inline(always)]
+    fn bits(self) -> u64 {
+        self.to_bits()
+    }
+    fn pool() -> &'static Pool<f64> {
+        static POOL: Pool<f64> = Pool::new();
+        &POOL
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Float;
+
+    #[test]
+    fn exp_in_f32_is_within_two_units_in_the_last_place() {
+        let mut x = -87.0f32;
+        while x < 88.5 {
+            let exact = (x as f64).exp();
+            let error = (Float::exp(x) as f64 - exact).abs() / exact;
+            assert!(error < 2.0 * f32::EPSILON as f64, "exp({x}): relative error {error:e}");
+            x += 0.0137;
+        }
+        assert_eq!(Float::exp(-200.0f32), 0.0);
+        assert_eq!(Float::exp(f32::NEG_INFINITY), 0.0);
+        assert_eq!(Float::exp(200.0f32), f32::INFINITY);
+        assert_eq!(Float::exp(0.0f32), 1.0);
+        assert!(Float::exp(f32::NAN).is_nan());
+        let subnormal = Float::exp(-95.0f32);
+        assert!((subnormal as f64 / (-95.0f64).exp() - 1.0).abs() < 1e-3, "{subnormal:e}");
+    }
+
+    #[test]
+    fn erf_in_f32_follows_libm() {
+        for i in -6000..=6000 {
+            let x = i as f32 * 1e-3;
+            let error = (Float::erf(x) as f64 - libm::erf(x as f64)).abs();
+            assert!(error < 5e-7, "erf({x}): error {error:e}");
+        }
+        assert!(Float::erf(f32::NAN).is_nan());
+    }
+
+    #[test]
+    fn max_and_min_propagate_nan_from_either_side() {
+        for (a, b) in [(f32::NAN, 1.0), (1.0, f32::NAN)] {
+            assert!(Float::max(a, b).is_nan() && Float::min(a, b).is_nan());
+        }
+        assert_eq!((Float::max(1.0f64, 2.0), Float::min(1.0f64, 2.0)), (2.0, 1.0));
+    }
+
+    #[test]
+    fn sigmoid_is_finite_at_both_ends() {
+        assert_eq!(Float::sigmoid(-1000.0f64), 0.0);
+        assert_eq!(Float::sigmoid(1000.0f64), 1.0);
+        assert!(Float::sigmoid(f64::NAN).is_nan());
+    }
+}

@@ -1,0 +1,34 @@
+//! Tensors and the tape: what an op needs, and nothing that knows a particular op.
+//!
+//! | file | idea |
+//! |---|---|
+//! | [`shape`] | extents, row-major strides, broadcasting |
+//! | [`float`] | `f32` to train in, `f64` to check in |
+//! | [`pool`] | buffers that are reused, not allocated |
+//! | `data` | [`Tensor`]: a shape over shared memory |
+//! | [`tape`] | the record of a computation, and its reversal |
+//! | [`var`] | [`Var`]: a tensor that a tape may track |
+//! | [`gradients`] | where gradients are accumulated and read |
+//! | [`gemm`] | matrix products (faer) |
+//! | [`parallel`] | threads, with the same bits for any number of them |
+//! | [`simd`] | run-time choice of instruction set |
+
+mod data;
+pub mod float;
+pub mod gemm;
+pub mod gemm_small;
+pub mod gradients;
+pub mod parallel;
+pub mod pool;
+pub mod shape;
+pub mod simd;
+pub mod tape;
+pub mod var;
+
+pub use data::Tensor;
+pub use float::Float;
+pub use gemm::Accum;
+pub use gradients::{GradSink, Gradients, Upstream};
+pub use shape::Shape;
+pub use tape::Tape;
+pub use var::Var;

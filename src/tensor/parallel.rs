@@ -1,0 +1,140 @@
+//! Threads inside kernels: work is cut into chunks whose bounds depend on shapes alone, so that the bits of a result
+//! do not depend on how many threads there were.
+
+use std::cell::RefCell;
+use std::sync::{Arc, Mutex};
+
+use rayon::prelude::*;
+
+/// Where the chunks of a kernel run.
+#[derive(Clone, Default)]
+enum Width {
+    /// In rayon's pool of whoever calls.
+    #[default]
+    Ambient,
+    /// One after the other, on the calling thread.
+    One,
+    /// In a pool of a given size.
+    Pool(Arc<rayon::ThreadPool>),
+}
+
+thread_local! {
+    static WIDTH: RefCell<Width> = const { RefCell::new(Width::Ambient) };
+}
+
+/// Runs `f` with kernels on `threads` threads. `f` stays on the calling thread, so it need not be `Send`.
+///
+/// # Panics
+/// If `threads` is 0, or the system cannot start that many.
+pub fn with_threads<R>(threads: usize, f: impl FnOnce() -> R) -> R {
+    struct Restore(Width);
+    impl Drop for Restore {
+        fn drop(&mut self) {
+            WIDTH.set(std::mem::take(&mut self.0));
+        }
+    }
+    let width = if threads == 1 { Width::One } else { Width::Pool(pool_of(threads)) };
+    let _restore = Restore(WIDTH.replace(width));
+    f()
+}
+
+/// One pool for each size asked for, kept.
+fn pool_of(threads: usize) -> Arc<rayon::ThreadPool> {
+    static POOLS: Mutex<Vec<Arc<rayon::ThreadPool>>> = Mutex::new(Vec::new());
+    assert!(threads > 0, "at least one thread");
+    let mut pools = POOLS.lock().expect("no panic holds this lock");
+    if let Some(pool) = pools.iter().find(|p| p.current_num_threads() == threads) {
+        return pool.clone();
+    }
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("the system starts threads");
+    pools.push(Arc::new(pool));
+    pools[pools.len() - 1].clone()
+}
+
+/// How many threads kernels run on.
+pub fn threads() -> usize {
+    match WIDTH.with_borrow(Width::clone) {
+        Width::Ambient => rayon::current_num_threads(),
+        Width::One => 1,
+        Width::Pool(pool) => pool.current_num_threads(),
+    }
+}
+
+/// Whether work of this size stays on the calling thread.
+fn stays(pieces: usize, work: usize) -> bool {
+    pieces < 2 || work < WORTHWHILE || threads() == 1
+}
+
+/// Runs `f` inside the pool that kernels use.
+fn in_pool<R: Send>(f: impl FnOnce() -> R + Send) -> R {
+    match WIDTH.with_borrow(Width::clone) {
+        Width::Pool(pool) => pool.install(f),
+        _ => f(),
+    }
+}
+
+/// Calls `f(i)` for every i below `count`, on all threads. `work` is a rough count of elementary operations: below
+/// [`WORTHWHILE`] everything stays on the calling thread.
+pub fn for_each(count: usize, work: usize, f: impl Fn(usize) + Sync + Send) {
+    if stays(count, work) {
+        (0..count).for_each(f);
+    } else {
+        in_pool(|| (0..count).into_par_iter().with_max_len(1).for_each(f));
+    }
+}
+
+/// Collects `f(i)` for every i below `count`, in order.
+pub fn map<R: Send>(count: usize, work: usize, f: impl Fn(usize) -> R + Sync + Send) -> Vec<R> {
+    if stays(count, work) {
+        (0..count).map(f).collect()
+    } else {
+        in_pool(|| (0..count).into_par_iter().with_max_len(1).map(f).collect())
+    }
+}
+
+/// Cuts `data` into chunks of `chunk` elements (the last may be shorter) and calls `f(index, chunk)` for each.
+pub fn for_each_chunk<T: Send>(data: &mut [T], chunk: usize, work: usize, f: impl Fn(usize, &mut [T]) + Sync + Send) {
+    let chunk = chunk.max(1);
+    if stays(data.len().div_ceil(chunk), work) {
+        data.chunks_mut(chunk).enumerate().for_each(|(i, c)| f(i, c));
+    } else {
+        in_pool(|| data.par_chunks_mut(chunk).enumerate().with_max_len(1).for_each(|(i, c)| f(i, c)));
+    }
+}
+
+/// Calls `f` for every piece: for kernels that write several slices, cut and zipped by the caller.
+pub fn for_each_piece<P: Send>(pieces: impl IntoIterator<Item = P>, work: usize, f: impl Fn(P) + Sync + Send) {
+    let pieces: Vec<P> = pieces.into_iter().collect();
+    if stays(pieces.len(), work) {
+        pieces.into_iter().for_each(f);
+    } else {
+        in_pool(|| pieces.into_par_iter().with_max_len(1).for_each(f));
+    }
+}
+
+/// Elementary operations below which handing work over costs more than it saves.
+pub const WORTHWHILE: usize = 1 << 14;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_chunk_is_visited_once_for_any_width() {
+        for threads in [1, 2, 3] {
+            let mut data = vec![0usize; 100_003];
+            with_threads(threads, || {
+                assert_eq!(super::threads(), threads);
+                for_each_chunk(&mut data, 1000, usize::MAX, |i, chunk| chunk.iter_mut().for_each(|x| *x += i + 1));
+            });
+            assert!(data.iter().enumerate().all(|(i, &x)| x == i / 1000 + 1));
+        }
+    }
+
+    #[test]
+    fn the_width_is_restored_even_after_a_panic() {
+        let before = threads();
+        let _ = std::panic::catch_unwind(|| with_threads(1, || panic!("on purpose")));
+        assert_eq!(threads(), before);
+    }
+}
