@@ -11,11 +11,38 @@ pub struct Linear {
     pub tile: usize,
 }
 
-impl Linear {
-    /// Rows a tile: about 2^17 multiplications, at least 32 rows.
-    fn tile(&self, k: usize, n: usize) -> usize {
-        if self.tile > 0 { self.tile } else { ((1 << 17) / (k * n).max(1)).clamp(32, 1024) }
-    }
+/// Rows a tile: about 2^17 multiplications, at least 32 rows; or `tile`, if that is given.
+fn tile_rows(tile: usize, k: usize, n: usize) -> usize {
+    if tile > 0 { tile } else { ((1 << 17) / (k * n).max(1)).clamp(32, 1024) }
+}
+
+/// `out = x w (+ b)`.
+pub(crate) fn forward<T: Float>(out: &mut [T], x: Rows<T>, w: &[T], b: Option<&[T]>, tile: usize) {
+    let k = x.cols;
+    let n = out.len() / x.rows.max(1);
+    let tile = tile_rows(tile, k, n);
+    let work = 2 * out.len() * k;
+    parallel::for_each_chunk(out, tile * n, work, |i, out| {
+        let rows = out.len() / n;
+        let mut accum = Accum::Replace;
+        if let Some(b) = b {
+            out.chunks_exact_mut(n).for_each(|row| row.copy_from_slice(b));
+            accum = Accum::Add;
+        }
+        gemm(RowsMut::dense(out, rows, n), accum, x.rows(i * tile, rows), Rows::dense(w, k, n), T::ONE);
+    });
+}
+
+/// `dx = dy w^T`.
+pub(crate) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, dy: Rows<T>, w: &[T], tile: usize) {
+    let n = dy.cols;
+    let k = out.len() / dy.rows.max(1);
+    let tile = tile_rows(tile, k, n);
+    let work = 2 * out.len() * n;
+    parallel::for_each_chunk(out, tile * k, work, |i, out| {
+        let rows = out.len() / k;
+        gemm(RowsMut::dense(out, rows, k), accum, dy.rows(i * tile, rows), Rows::dense(w, k, n).t(), T::ONE);
+    });
 }
 
 /// How many partial sums a weight gradient is made of: depends on the shape alone.
@@ -48,22 +75,9 @@ impl<T: Float> Op<T> for Linear {
 
     fn forward(&self, inputs: &[&Tensor<T>], needs: &Needs) -> (Vec<Tensor<T>>, Self::Saved) {
         let (x, w, b) = (inputs[0], inputs[1], inputs.get(2));
-        let [k, n] = [w.dims()[0], w.dims()[1]];
-        let shape = x.shape().with(x.shape().rank() - 1, n);
-        let tile = self.tile(k, n);
-        let y = Tensor::build(shape, |out| {
-            let work = 2 * out.len() * k;
-            parallel::for_each_chunk(out, tile * n, work, |i, out| {
-                let rows = out.len() / n;
-                let x = Rows::dense(&x.data()[i * tile * k..][..rows * k], rows, k);
-                let mut accum = Accum::Replace;
-                if let Some(b) = b {
-                    out.chunks_exact_mut(n).for_each(|row| row.copy_from_slice(b.data()));
-                    accum = Accum::Add;
-                }
-                gemm(RowsMut::dense(out, rows, n), accum, x, Rows::dense(w.data(), k, n), T::ONE);
-            });
-        });
+        let shape = x.shape().with(x.shape().rank() - 1, w.dims()[1]);
+        let rows = Rows::dense(x.data(), x.shape().rows(), w.dims()[0]);
+        let y = Tensor::build(shape, |out| forward(out, rows, w.data(), b.map(|b| b.data()), self.tile));
         (vec![y], (needs.get(1).then(|| x.clone()), needs.get(0).then(|| w.clone())))
     }
 
@@ -72,16 +86,8 @@ impl<T: Float> Op<T> for Linear {
         let g = upstream.only();
         let (rows, n) = (g.shape().rows(), g.shape().last());
         if let Some(w) = w {
-            let k = w.dims()[0];
-            let tile = self.tile(k, n);
-            sink.accumulate(0, |out, accum| {
-                let work = 2 * g.len() * k;
-                parallel::for_each_chunk(out, tile * k, work, |i, out| {
-                    let rows = out.len() / k;
-                    let g = Rows::dense(&g.data()[i * tile * n..][..rows * n], rows, n);
-                    gemm(RowsMut::dense(out, rows, k), accum, g, Rows::dense(w.data(), k, n).t(), T::ONE);
-                });
-            });
+            let g = Rows::dense(g.data(), rows, n);
+            sink.accumulate(0, |out, accum| input_gradient(out, accum, g, w.data(), self.tile));
         }
         if let Some(x) = x {
             let k = x.shape().last();
@@ -100,10 +106,7 @@ pub(crate) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, x: Rows<T>,
     let step = rows.div_ceil(parts).max(1);
     let product = |part: usize, out: &mut [T], accum| {
         let (from, to) = ((part * step).min(rows), ((part + 1) * step).min(rows));
-        let cut = |m: Rows<'_, T>| -> (usize, usize) { (from * m.row_stride, to - from) };
-        let ((xi, count), (gi, _)) = (cut(x), cut(g));
-        let x = Rows { data: if count == 0 { &[] } else { &x.data[xi..] }, rows: count, ..x };
-        let g = Rows { data: if count == 0 { &[] } else { &g.data[gi..] }, rows: count, ..g };
+        let (x, g) = (x.rows(from, to - from), g.rows(from, to - from));
         gemm(RowsMut::dense(out, k, n), accum, x.t(), g, T::ONE);
     };
     if parts == 1 {

@@ -10,6 +10,7 @@ pub mod registry;
 pub mod trace;
 
 pub mod binary;
+pub mod conv2d;
 pub mod linear;
 pub mod matmul;
 pub mod reduce;
@@ -18,4 +19,5 @@ pub mod unary;
 
 pub use apply::{apply, apply1};
 pub use case::{Case, Input};
+pub use conv2d::Conv2d;
 pub use op::{Checked, CustomOp, Needs, Op, Registered, ShapeError};

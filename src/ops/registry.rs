@@ -47,6 +47,7 @@ registry! {
     "permute" => shape_ops::Permute,
     "matmul" => matmul::Matmul,
     "linear" => linear::Linear,
+    "conv2d" => conv2d::Conv2d,
 }
 
 /// One op as the suite sees it.

@@ -67,6 +67,17 @@ impl<'a, T> Rows<'a, T> {
         Rows { data: if rows * cols == 0 { &[] } else { &data[first..] }, rows, cols, row_stride }
     }
 
+    /// Some of the rows.
+    ///
+    /// # Panics
+    /// If there are not as many.
+    #[track_caller]
+    pub fn rows(self, first: usize, count: usize) -> Self {
+        assert!(first + count <= self.rows, "rows {first}..{} of {}", first + count, self.rows);
+        let data = if count * self.cols == 0 { &[] } else { &self.data[first * self.row_stride..] };
+        Rows { data, rows: count, ..self }
+    }
+
     /// The transposed view, for a product.
     pub fn t(self) -> Operand<'a, T> {
         Operand { matrix: self, transposed: true }

@@ -1,0 +1,133 @@
+//! How a convolution's input, window and output lie.
+
+use super::Conv2d;
+use crate::ops::ShapeError;
+use crate::tensor::Shape;
+
+/// Everything about a convolution but its numbers. Pairs are (height, width).
+#[derive(Clone, Copy, Debug)]
+pub struct Geometry {
+    pub(super) batch: usize,
+    pub(super) size: [usize; 2],
+    pub(super) channels: usize,
+    pub(super) out: [usize; 2],
+    pub(super) out_channels: usize,
+    pub(super) kernel: [usize; 2],
+    pub(super) stride: [usize; 2],
+    pub(super) padding: [usize; 2],
+    pub(super) dilation: [usize; 2],
+    pub(super) groups: usize,
+    pub(super) reflect: bool,
+    pub(super) tile: usize,
+}
+
+impl Geometry {
+    pub(super) fn new(op: &Conv2d, x: &Shape, w: &Shape) -> Result<Self, ShapeError> {
+        let (Some([batch, h, wd, channels]), Some([kh, kw, per_group, out_channels])) = (x.nhwc(), w.nhwc()) else {
+            return Err(ShapeError::new("expected x [batch, height, width, in] and w [kh, kw, in / groups, out]"));
+        };
+        if op.groups == 0 || per_group * op.groups != channels || out_channels % op.groups != 0 {
+            return Err(ShapeError::new(format!("{channels} channels in {} groups do not fit the weights", op.groups)));
+        }
+        let mut out = [0; 2];
+        for d in 0..2 {
+            let (size, kernel) = ([h, wd][d], [kh, kw][d]);
+            if kernel == 0 || op.stride[d] == 0 || op.dilation[d] == 0 {
+                return Err(ShapeError::new("window, stride and dilation are at least 1"));
+            }
+            if op.reflect && op.padding[d] >= size {
+                return Err(ShapeError::new(format!(
+                    "a padding of {} cannot mirror an extent of {size}",
+                    op.padding[d]
+                )));
+            }
+            let reach = op.dilation[d] * (kernel - 1) + 1;
+            let room = (size + 2 * op.padding[d]).checked_sub(reach);
+            out[d] =
+                room.ok_or_else(|| ShapeError::new("the window is larger than the padded image"))? / op.stride[d] + 1;
+        }
+        Ok(Geometry {
+            batch,
+            size: [h, wd],
+            channels,
+            out,
+            out_channels,
+            kernel: [kh, kw],
+            stride: op.stride,
+            padding: op.padding,
+            dilation: op.dilation,
+            groups: op.groups,
+            reflect: op.reflect,
+            tile: op.tile,
+        })
+    }
+
+    /// The input row or column under window position `k` of output row or column `o`; `None` in zero padding.
+    #[inline(always)]
+    pub(super) fn source(&self, d: usize, o: usize, k: usize) -> Option<usize> {
+        let i = (o * self.stride[d] + k * self.dilation[d]) as isize - self.padding[d] as isize;
+        let n = self.size[d] as isize;
+        if (0..n).contains(&i) {
+            Some(i as usize)
+        } else if self.reflect {
+            Some(if i < 0 { -i } else { 2 * (n - 1) - i } as usize)
+        } else {
+            None
+        }
+    }
+
+    /// Output columns whose whole window lies inside the image.
+    pub(super) fn inside(&self) -> std::ops::Range<usize> {
+        let first = self.padding[1].div_ceil(self.stride[1]);
+        let reach = self.dilation[1] * (self.kernel[1] - 1) + 1;
+        let last = (self.size[1] + self.padding[1]).checked_sub(reach).map_or(0, |room| room / self.stride[1] + 1);
+        first..last.clamp(first, self.out[1].max(first))
+    }
+
+    /// Channels of the input that one group sees.
+    pub(super) fn group_in(&self) -> usize {
+        self.channels / self.groups
+    }
+
+    /// Channels of the output that one group makes.
+    pub(super) fn group_out(&self) -> usize {
+        self.out_channels / self.groups
+    }
+
+    /// Numbers in one patch of one group: the columns of the im2col matrix.
+    pub(super) fn patch(&self) -> usize {
+        self.kernel[0] * self.kernel[1] * self.group_in()
+    }
+
+    /// Rows of output pixels, over the whole batch.
+    pub(super) fn rows(&self) -> usize {
+        self.batch * self.out[0]
+    }
+
+    /// Output rows a tile: an im2col matrix of some 256 KiB, and at least four tiles where there are four rows.
+    pub(super) fn tile(&self) -> usize {
+        const ELEMENTS: usize = 1 << 16;
+        if self.tile > 0 {
+            return self.tile;
+        }
+        let fitting = ELEMENTS / (self.patch() * self.out[1]).max(1);
+        fitting.clamp(1, self.rows().div_ceil(4).max(1))
+    }
+
+    /// The convolution of dy that gives dx, if it is one: stride 1, and a window that reaches beyond the padding.
+    pub(super) fn transposed(&self) -> Option<Geometry> {
+        let mut padding = [0; 2];
+        for (d, p) in padding.iter_mut().enumerate() {
+            *p = (self.dilation[d] * (self.kernel[d] - 1)).checked_sub(self.padding[d])?;
+        }
+        (self.stride == [1; 2]).then_some(Geometry {
+            size: self.out,
+            channels: self.out_channels,
+            out: self.size,
+            out_channels: self.channels,
+            padding,
+            reflect: false,
+            ..*self
+        })
+    }
+}

@@ -1,0 +1,249 @@
+//! The three products of a convolution, tile by tile: outputs, the gradient of the input, the gradient of the weights.
+
+use super::geometry::Geometry;
+use crate::ops::linear::sum_into;
+use crate::tensor::gemm::{Rows, RowsMut, gemm};
+use crate::tensor::pool::Buffer;
+use crate::tensor::{Accum, Float, Tensor, parallel, simd};
+
+/// Copies a run, in whole vectors as far as they go: runs are too short for a call to `memcpy`.
+#[inline(always)]
+fn copy_run<T: Copy>(to: &mut [T], from: &[T]) {
+    let ((to, to_rest), (from, from_rest)) = (to.as_chunks_mut::<8>(), from.as_chunks::<8>());
+    to.iter_mut().zip(from).for_each(|(t, f)| *t = *f);
+    to_rest.iter_mut().zip(from_rest).for_each(|(t, f)| *t = *f);
+}
+
+/// Fills the im2col rows of the output pixels of row `oy`, for one group: `[out width, patch]`.
+fn im2col<T: Float>(g: &Geometry, image: &[T], oy: usize, group: usize, patches: &mut [T]) {
+    let (c, cg, kw, patch) = (g.channels, g.group_in(), g.kernel[1], g.patch());
+    let run = kw * cg;
+    // Where runs are whole: no dilation along the row, and all channels.
+    let whole = if g.dilation[1] == 1 && g.groups == 1 { g.inside() } else { 0..0 };
+    simd::dispatch(
+        #[inline(always)]
+        || {
+            for ky in 0..g.kernel[0] {
+                let Some(iy) = g.source(0, oy, ky) else {
+                    patches.chunks_exact_mut(patch).for_each(|p| p[ky * run..(ky + 1) * run].fill(T::ZERO));
+                    continue;
+                };
+                let row = &image[iy * g.size[1] * c..(iy + 1) * g.size[1] * c];
+                for (ox, p) in patches.chunks_exact_mut(patch).enumerate() {
+                    let p = &mut p[ky * run..(ky + 1) * run];
+                    if whole.contains(&ox) {
+                        let first = (ox * g.stride[1] - g.padding[1]) * c;
+                        copy_run(p, &row[first..first + run]);
+                        continue;
+                    }
+                    for (kx, p) in p.chunks_exact_mut(cg).enumerate() {
+                        match g.source(1, ox, kx) {
+                            Some(ix) => copy_run(p, &row[ix * c + group * cg..ix * c + (group + 1) * cg]),
+                            None => p.fill(T::ZERO),
+                        }
+                    }
+                }
+            }
+        },
+    );
+}
+
+/// The im2col matrix of the output rows `first..first + rows` (over the whole batch), for one group.
+fn im2col_tile<T: Float>(g: &Geometry, x: &[T], first: usize, rows: usize, group: usize, patches: &mut [T]) {
+    let (row, image) = (g.out[1] * g.patch(), g.size[0] * g.size[1] * g.channels);
+    for (r, patches) in (first..first + rows).zip(patches.chunks_exact_mut(row)) {
+        let b = r / g.out[0];
+        im2col(g, &x[b * image..(b + 1) * image], r % g.out[0], group, patches);
+    }
+}
+
+/// `out = conv(x, w) + bias`, or added to what is there.
+pub(super) fn convolve<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: &[T], w: &[T], bias: Option<&[T]>) {
+    let (n, patch, width, tile) = (g.out_channels, g.patch(), g.out[1], g.tile());
+    let work = 2 * g.rows() * width * patch * n;
+    parallel::for_each_chunk(out, tile * width * n, work, |i, out| {
+        let rows = out.len() / (width * n);
+        let mut accum = accum;
+        if let Some(bias) = bias {
+            for pixel in out.chunks_exact_mut(n) {
+                match accum {
+                    Accum::Replace => pixel.copy_from_slice(bias),
+                    Accum::Add => pixel.iter_mut().zip(bias).for_each(|(y, &b)| *y += b),
+                }
+            }
+            accum = Accum::Add;
+        }
+        let pixels = rows * width;
+        let mut patches = Buffer::stale(pixels * patch);
+        for group in 0..g.groups {
+            im2col_tile(g, x, i * tile, rows, group, &mut patches);
+            let (first, ng) = (group * g.group_out(), g.group_out());
+            let weights = Rows::columns(w, patch, n, first, ng);
+            gemm(
+                RowsMut::columns(out, pixels, n, first, ng),
+                accum,
+                Rows::dense(&patches, pixels, patch),
+                weights,
+                T::ONE,
+            );
+        }
+    });
+}
+
+/// The window turned by half a circle, with inputs and outputs exchanged: `[kh, kw, out / groups, in]`.
+fn turned<T: Float>(g: &Geometry, w: &[T]) -> Buffer<T> {
+    let (cg, ng, taps) = (g.group_in(), g.group_out(), g.kernel[0] * g.kernel[1]);
+    let mut out = Buffer::stale(w.len());
+    for (tap, block) in out.chunks_exact_mut((ng * g.channels).max(1)).enumerate() {
+        let from = &w[(taps - 1 - tap) * cg * g.out_channels..][..cg * g.out_channels];
+        for (j, row) in block.chunks_exact_mut(g.channels).enumerate() {
+            for (c, v) in row.iter_mut().enumerate() {
+                *v = from[(c % cg) * g.out_channels + (c / cg) * ng + j];
+            }
+        }
+    }
+    out
+}
+
+/// dx from dy.
+pub(super) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, dy: &[T], w: &[T]) {
+    match g.transposed() {
+        Some(t) => {
+            let turned = turned(g, w);
+            convolve(out, accum, &t, dy, &turned, None);
+            if g.reflect {
+                mirrored_border(out, g, &t, dy, &turned);
+            }
+        }
+        None => scatter(out, accum, g, dy, w),
+    }
+}
+
+/// What the mirrored padding adds to dx: the gradient at every padded position goes to the pixel mirrored there.
+fn mirrored_border<T: Float>(out: &mut [T], g: &Geometry, t: &Geometry, dy: &[T], turned: &[T]) {
+    // The same convolution of dy over the padded extent; of its rows and columns only the border is computed.
+    let [ph, pw] = g.padding;
+    let padded = Geometry {
+        out: [g.size[0] + 2 * ph, g.size[1] + 2 * pw],
+        padding: [t.padding[0] + ph, t.padding[1] + pw],
+        ..*t
+    };
+    let is_border = |y: usize, x: usize| y < ph || y >= ph + g.size[0] || x < pw || x >= pw + g.size[1];
+    let positions: Vec<(usize, usize)> = (0..padded.out[0])
+        .flat_map(|y| (0..padded.out[1]).map(move |x| (y, x)))
+        .filter(|&(y, x)| is_border(y, x))
+        .collect();
+    let mirror = |i: usize, p: usize, n: usize| {
+        let i = i as isize - p as isize;
+        (if i < 0 {
+            -i
+        } else if i >= n as isize {
+            2 * (n as isize - 1) - i
+        } else {
+            i
+        }) as usize
+    };
+    let (patch, c, image) = (padded.patch(), g.channels, g.out[0] * g.out[1] * g.out_channels);
+    let work = 2 * g.batch * positions.len() * patch * c;
+    parallel::for_each_chunk(out, g.size[0] * g.size[1] * c, work, |b, out| {
+        let mut patches = Buffer::stale(positions.len() * patch);
+        let mut sums = Buffer::stale(positions.len() * c);
+        for group in 0..g.groups {
+            for (&(y, x), p) in positions.iter().zip(patches.chunks_exact_mut(patch)) {
+                gather_patch(&padded, &dy[b * image..(b + 1) * image], y, x, group, p);
+            }
+            let (first, cg) = (group * g.group_in(), g.group_in());
+            let weights = Rows::columns(turned, patch, c, first, cg);
+            let patches = Rows::dense(&patches, positions.len(), patch);
+            gemm(RowsMut::columns(&mut sums, positions.len(), c, first, cg), Accum::Replace, patches, weights, T::ONE);
+        }
+        for (&(y, x), sum) in positions.iter().zip(sums.chunks_exact(c)) {
+            let to = (mirror(y, ph, g.size[0]) * g.size[1] + mirror(x, pw, g.size[1])) * c;
+            out[to..to + c].iter_mut().zip(sum).for_each(|(d, &s)| *d += s);
+        }
+    });
+}
+
+/// The patch of one output pixel, for one group.
+fn gather_patch<T: Float>(g: &Geometry, image: &[T], oy: usize, ox: usize, group: usize, patch: &mut [T]) {
+    let (c, cg) = (g.channels, g.group_in());
+    for (k, p) in patch.chunks_exact_mut(cg).enumerate() {
+        match (g.source(0, oy, k / g.kernel[1]), g.source(1, ox, k % g.kernel[1])) {
+            (Some(iy), Some(ix)) => {
+                p.copy_from_slice(&image[(iy * g.size[1] + ix) * c + group * cg..][..cg]);
+            }
+            _ => p.fill(T::ZERO),
+        }
+    }
+}
+
+/// dx where it is no convolution (strided): the gradients of patches, added to the pixels they were copied from.
+/// Patches overlap, so an image belongs to one thread.
+fn scatter<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, dy: &[T], w: &[T]) {
+    let (c, cg, n, ng, patch, width) = (g.channels, g.group_in(), g.out_channels, g.group_out(), g.patch(), g.out[1]);
+    let work = 2 * g.rows() * width * patch * n;
+    parallel::for_each_chunk(out, g.size[0] * g.size[1] * c, work, |b, out| {
+        if accum == Accum::Replace {
+            out.fill(T::ZERO);
+        }
+        let tile = g.tile().min(g.out[0]).max(1);
+        let mut patches = Buffer::stale(tile * width * patch);
+        for first in (0..g.out[0]).step_by(tile) {
+            let rows = tile.min(g.out[0] - first);
+            let pixels = rows * width;
+            let dy = &dy[(b * g.out[0] + first) * width * n..][..pixels * n];
+            for group in 0..g.groups {
+                let weights = Rows::columns(w, patch, n, group * ng, ng).t();
+                let patches = &mut patches[..pixels * patch];
+                let dy = Rows::columns(dy, pixels, n, group * ng, ng);
+                gemm(RowsMut::dense(patches, pixels, patch), Accum::Replace, dy, weights, T::ONE);
+                for (pixel, p) in patches.chunks_exact(patch).enumerate() {
+                    let (oy, ox) = (first + pixel / width, pixel % width);
+                    for (k, p) in p.chunks_exact(cg).enumerate() {
+                        if let (Some(iy), Some(ix)) =
+                            (g.source(0, oy, k / g.kernel[1]), g.source(1, ox, k % g.kernel[1]))
+                        {
+                            let to = (iy * g.size[1] + ix) * c + group * cg;
+                            out[to..to + cg].iter_mut().zip(p).for_each(|(d, &p)| *d += p);
+                        }
+                    }
+                }
+            }
+        }
+    });
+}
+
+/// dw: the sum over pixels of patch^T dy, in a fixed number of partial sums.
+pub(super) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: &[T], dy: &[T]) {
+    let (n, ng, patch, width, tile) = (g.out_channels, g.group_out(), g.patch(), g.out[1], g.tile());
+    let tiles = g.rows().div_ceil(tile);
+    let parts = tiles.clamp(1, PARTS);
+    let partial = |part: usize, sum: &mut [T], mut accum: Accum| {
+        let mine = part * tiles / parts..(part + 1) * tiles / parts;
+        if mine.is_empty() && accum == Accum::Replace {
+            sum.fill(T::ZERO);
+        }
+        let mut patches = Buffer::stale(tile.min(g.rows()) * width * patch);
+        for first in mine.map(|t| t * tile) {
+            let rows = tile.min(g.rows() - first);
+            let pixels = rows * width;
+            for group in 0..g.groups {
+                let patches = &mut patches[..pixels * patch];
+                im2col_tile(g, x, first, rows, group, patches);
+                let dy = Rows::columns(&dy[first * width * n..][..pixels * n], pixels, n, group * ng, ng);
+                let patches = Rows::dense(patches, pixels, patch).t();
+                gemm(RowsMut::columns(sum, patch, n, group * ng, ng), accum, patches, dy, T::ONE);
+            }
+            accum = Accum::Add;
+        }
+    };
+    if parts == 1 {
+        return partial(0, out, accum);
+    }
+    let work = 2 * g.rows() * width * patch * n;
+    let sums = parallel::map(parts, work, |part| Tensor::build([patch, n], |sum| partial(part, sum, Accum::Replace)));
+    sum_into(out, accum, &sums);
+}
+
+/// Partial sums of a weight gradient.
+const PARTS: usize = 4;
