@@ -43,6 +43,11 @@ impl Random {
         random
     }
 
+    /// The generator itself, for code that draws from it directly.
+    pub fn chacha(&mut self) -> &mut ChaCha8Rng {
+        &mut self.chacha
+    }
+
     /// 64 random bits.
     pub fn bits(&mut self) -> u64 {
         self.chacha.next_u64()

@@ -1,0 +1,192 @@
+//! Batches: triplets of frames as tensors, augmented, made ahead of time on a thread of their own.
+//!
+//! What a batch holds is a function of the seed and the step alone, so a resumed run sees what it would have seen.
+
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, sync_channel};
+use std::thread::JoinHandle;
+
+use image::RgbImage;
+use serde::{Deserialize, Serialize};
+
+use super::augment::{Jitter, flip, flip_intrinsics};
+use super::resize::lanczos;
+use super::{Dataset, Intrinsics};
+use crate::error::{Error, Result};
+use crate::random::Random;
+use crate::tensor::Tensor;
+
+/// What is done to samples before training.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Augment {
+    /// Mirror a sample with probability 1/2.
+    pub flip: bool,
+    /// Change its colours with probability 1/2: the networks see the changed images, the loss the plain ones.
+    pub jitter: bool,
+}
+
+impl Default for Augment {
+    fn default() -> Self {
+        Augment { flip: true, jitter: true }
+    }
+}
+
+/// A batch of triplets, images as `[B, h, w, 3]` in [0, 1].
+#[derive(Clone, Debug)]
+pub struct Batch {
+    /// The plain target at 1, 1/2, 1/4, 1/8 of its size.
+    pub pyramid: Vec<Tensor<f32>>,
+    /// The plain previous and next frames.
+    pub sources: [Tensor<f32>; 2],
+    /// Previous, target and next frame as the networks see them.
+    pub seen: [Tensor<f32>; 3],
+    /// fx, fy, cx, cy of each sample in pixels.
+    pub intrinsics: Vec<[f64; 4]>,
+}
+
+/// Images of one size side by side, as `[B, h, w, 3]` in [0, 1].
+///
+/// # Panics
+/// If their sizes differ.
+pub fn to_tensor(images: &[&RgbImage]) -> Tensor<f32> {
+    let (w, h) = images.first().map_or((0, 0), |i| i.dimensions());
+    assert!(images.iter().all(|i| i.dimensions() == (w, h)), "images of one size");
+    Tensor::build([images.len(), h as usize, w as usize, 3], |out| {
+        let bytes = images.iter().flat_map(|i| i.as_raw());
+        out.iter_mut().zip(bytes).for_each(|(x, &b)| *x = b as f32 * (1.0 / 255.0));
+    })
+}
+
+/// Intrinsics in pixels: fx, fy, cx, cy.
+pub fn in_pixels(camera: Intrinsics, width: usize, height: usize) -> [f64; 4] {
+    let (w, h) = (width as f64, height as f64);
+    [camera.fx * w, camera.fy * h, camera.cx * w, camera.cy * h]
+}
+
+/// The samples of a step: every epoch is a new order of all samples; a batch may straddle two.
+pub fn samples_of_step(len: usize, batch: usize, seed: u64, step: u64) -> Vec<usize> {
+    let mut orders: Vec<(u64, Vec<usize>)> = Vec::new();
+    let positions = (step * batch as u64..).take(batch);
+    positions
+        .map(|at| {
+            let epoch = at / len as u64;
+            if orders.last().is_none_or(|(e, _)| *e != epoch) {
+                let mut order: Vec<usize> = (0..len).collect();
+                Random::new(seed, ORDER_STREAM.wrapping_add(epoch)).shuffle(&mut order);
+                orders.push((epoch, order));
+            }
+            orders[orders.len() - 1].1[(at % len as u64) as usize]
+        })
+        .collect()
+}
+
+const ORDER_STREAM: u64 = 1 << 40;
+const AUGMENT_STREAM: u64 = 2 << 40;
+/// Scales of the target that the loss looks at.
+const SCALES: usize = 4;
+
+/// The batch of a step (from 0).
+pub fn batch_of_step(data: &dyn Dataset, augment: Augment, batch: usize, seed: u64, step: u64) -> Result<Batch> {
+    let samples = samples_of_step(data.len(), batch, seed, step);
+    let mut random = Random::new(seed, AUGMENT_STREAM.wrapping_add(step));
+    let mut pyramids: Vec<Vec<Arc<RgbImage>>> = Vec::new();
+    let mut sources: [Vec<Arc<RgbImage>>; 2] = Default::default();
+    let mut seen: [Vec<Arc<RgbImage>>; 3] = Default::default();
+    let mut intrinsics = Vec::new();
+    for sample in samples {
+        let (mirrored, jitter) = (random.coin() && augment.flip, Jitter::draw(random.chacha()));
+        let jitter = jitter.filter(|_| augment.jitter);
+        let mut camera = data.intrinsics(sample);
+        let mut plain = Vec::new();
+        for offset in [-1, 0, 1] {
+            let image = data.image(sample, offset)?;
+            plain.push(if mirrored { Arc::new(flip(&image)) } else { image });
+        }
+        let (w, h) = plain[1].dimensions();
+        if mirrored {
+            camera = flip_intrinsics(camera, w as usize);
+        }
+        intrinsics.push(in_pixels(camera, w as usize, h as usize));
+        let mut pyramid = vec![plain[1].clone()];
+        for s in 1..SCALES {
+            pyramid.push(Arc::new(lanczos(&pyramid[s - 1], w >> s, h >> s)));
+        }
+        pyramids.push(pyramid);
+        for (seen, image) in seen.iter_mut().zip(&plain) {
+            seen.push(jitter.as_ref().map_or_else(|| image.clone(), |j| Arc::new(j.apply(image))));
+        }
+        sources[0].push(plain[0].clone());
+        sources[1].push(plain[2].clone());
+    }
+    let tensor = |images: Vec<Arc<RgbImage>>| to_tensor(&images.iter().map(Arc::as_ref).collect::<Vec<_>>());
+    Ok(Batch {
+        pyramid: (0..SCALES).map(|s| tensor(pyramids.iter().map(|p| p[s].clone()).collect())).collect(),
+        sources: sources.map(tensor),
+        seen: seen.map(tensor),
+        intrinsics,
+    })
+}
+
+/// A thread that makes the batches of consecutive steps, a few ahead.
+pub struct Loader {
+    batches: Option<Receiver<Result<Batch>>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Loader {
+    /// Starts at `first_step` (from 0).
+    ///
+    /// # Errors
+    /// If there are fewer samples than a batch holds.
+    pub fn start(data: Arc<dyn Dataset>, augment: Augment, batch: usize, seed: u64, first_step: u64) -> Result<Self> {
+        if batch == 0 || data.len() < batch {
+            let message = format!("{batch} samples a batch, but the data holds {}: make it smaller", data.len());
+            return Err(Error::setting("--batch", message));
+        }
+        let (send, batches) = sync_channel(3);
+        let thread = std::thread::spawn(move || {
+            for step in first_step.. {
+                let made = batch_of_step(data.as_ref(), augment, batch, seed, step);
+                let last = made.is_err();
+                // The other end hangs up when training is over.
+                if send.send(made).is_err() || last {
+                    break;
+                }
+            }
+        });
+        Ok(Loader { batches: Some(batches), thread: Some(thread) })
+    }
+
+    /// The next batch.
+    pub fn next_batch(&mut self) -> Result<Batch> {
+        let batches = self.batches.as_ref().expect("there until dropped");
+        batches.recv().unwrap_or_else(|_| Err(Error::Failed("the thread that makes batches has stopped".into())))
+    }
+}
+
+impl Drop for Loader {
+    fn drop(&mut self) {
+        self.batches = None;
+        if let Some(thread) = self.thread.take() {
+            // A panic there was reported by the missing batch already.
+            let _ = thread.join();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_epoch_sees_every_sample_once() {
+        let seen: Vec<usize> = (0..5).flat_map(|step| samples_of_step(10, 4, 3, step)).collect();
+        for epoch in seen.chunks(10) {
+            let mut sorted = epoch.to_vec();
+            sorted.sort_unstable();
+            assert_eq!(sorted, (0..10).collect::<Vec<_>>());
+        }
+        assert_ne!(seen[..10], seen[10..], "a new order each epoch");
+    }
+}

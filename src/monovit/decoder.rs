@@ -1,0 +1,167 @@
+//! The depth decoder: nested (U-Net++-like) with channel attention on its diagonal (MonoViT, section 3.3; after HR-Depth,
+//! 2012.07356, and DIFFNet, 2110.09482).
+//!
+//! Node (i, j) stands at level i (1/2^(i+1) of the image) in column j. It joins the node below and before it, upsampled,
+//! with all the nodes to its left.
+
+use std::collections::BTreeMap;
+
+use super::config::Config;
+use crate::nn::{Builder, Context, Conv, ConvStart, Init, Linear};
+use crate::ops::Conv2d;
+use crate::tensor::{Float, Var};
+
+/// The five maps of the encoder to disparities (sigmoid, in [0, 1]) at 1, 1/2, 1/4, 1/8 of the image.
+#[derive(Clone, Debug)]
+pub struct Decoder {
+    /// Brings the encoder's maps 1..4 to the channels of the first column.
+    lateral: Vec<AttentionConv>,
+    /// `X_ij_Conv_0`: halves the channels on the way up. (Those of level 0 but the last stand in the public checkpoints
+    /// and take no part.)
+    up: BTreeMap<(usize, usize), ConvBlock>,
+    /// `X_ij_Conv_1`: makes node (i - 1, j + 1) of the concatenation; (0, 4) is the last block before the head.
+    join: BTreeMap<(usize, usize), ConvBlock>,
+    /// `X_ij_attention`: the diagonal.
+    attention: BTreeMap<(usize, usize), AttentionConv>,
+    /// `X_ij_downsample`: narrows long concatenations.
+    narrow: BTreeMap<(usize, usize), Conv>,
+    heads: Vec<Conv>,
+}
+
+/// The nodes in the order in which they can be computed.
+const ORDER: [(usize, usize); 10] =
+    [(0, 1), (1, 1), (2, 1), (3, 1), (0, 2), (1, 2), (2, 2), (0, 3), (1, 3), (0, 4)];
+
+/// Whether a node is made by channel attention: those on the diagonal.
+fn on_diagonal((i, j): (usize, usize)) -> bool {
+    i + j == 4
+}
+
+impl Decoder {
+    /// The parameters stand directly under the builder's path.
+    pub fn new<T: Float>(b: &mut Builder<T>, config: &Config) -> Self {
+        let b = &mut b.at("convs");
+        let (features, e, d) = (config.feature_channels(), config.lateral_channels(), config.decoder_channels());
+        let r = config.reduction;
+        // Channels of node (i, j).
+        let width = |i: usize, j: usize| match j {
+            0 => e[i],
+            _ => d[i + 1],
+        };
+        let mut lateral: Vec<AttentionConv> = (1..5)
+            .rev()
+            .map(|i| AttentionConv::new(&mut b.at(format!("f{i}")), [features[i], e[i]], r, "ca.fc", 3))
+            .collect();
+        lateral.reverse();
+
+        let mut up = BTreeMap::new();
+        for j in 0..5 {
+            for i in 0..=(4 - j) {
+                let channels = width(i, j);
+                let block = ConvBlock::new(&mut b.at(format!("X_{i}{j}_Conv_0")), [channels, channels / 2]);
+                up.insert((i, j), block);
+            }
+        }
+        let mut join = BTreeMap::new();
+        join.insert((0, 4), ConvBlock::new(&mut b.at("X_04_Conv_1"), [d[0]; 2]));
+
+        // Channels of the concatenation at node (i, j): the upsampled node below, and all to the left.
+        let joined = |i: usize, j: usize| width(i + 1, j - 1) / 2 + (0..j).map(|k| width(i, k)).sum::<usize>();
+        let mut attention = BTreeMap::new();
+        for (i, j) in [(3, 1), (2, 2), (1, 3), (0, 4)] {
+            let channels = [joined(i, j), width(i + 1, j - 1) / 2];
+            let mut b = b.at(format!("X_{i}{j}_attention"));
+            attention.insert((i, j), AttentionConv::new(&mut b, channels, r, "fc", 1));
+        }
+        let mut narrow = BTreeMap::new();
+        for (i, j) in ORDER.into_iter().filter(|&n| !on_diagonal(n)) {
+            let mut channels = joined(i, j);
+            if j > 1 {
+                let narrowed = 2 * d[i + 1];
+                let mut b = b.at(format!("X_{i}{j}_downsample.conv"));
+                let conv = Conv::new(&mut b, [channels, narrowed], 1, Conv2d::default(), ConvStart::FanIn);
+                narrow.insert((i, j), conv);
+                channels = narrowed;
+            }
+            let mut b = b.at(format!("X_{}{}_Conv_1", i + 1, j - 1));
+            join.insert((i + 1, j - 1), ConvBlock::new(&mut b, [channels, d[i + 1]]));
+        }
+        let heads = (0..4).map(|s| conv3x3(&mut b.at(format!("dispconv{s}")), [d[s], 1])).collect();
+        Decoder { lateral, up, join, attention, narrow, heads }
+    }
+
+    /// Disparities at 1, 1/2, 1/4, 1/8 of the image, `[B, h, w, 1]` each.
+    #[track_caller]
+    pub fn forward<T: Float>(&self, c: &Context<T>, features: &[Var<T>]) -> Vec<Var<T>> {
+        let mut nodes: BTreeMap<(usize, usize), Var<T>> = BTreeMap::new();
+        nodes.insert((0, 0), features[0].clone());
+        for (i, lateral) in self.lateral.iter().enumerate() {
+            nodes.insert((i + 1, 0), lateral.forward(c, &features[i + 1]));
+        }
+        for (i, j) in ORDER {
+            let below = (i + 1, j - 1);
+            let high = self.up[&below].forward(c, &nodes[&below]).upsample_nearest(2);
+            let mut parts = vec![&high];
+            parts.extend((0..j).map(|k| &nodes[&(i, k)]));
+            let z = Var::concat(&parts, 3);
+            let node = match self.attention.get(&(i, j)) {
+                Some(attention) => attention.forward(c, &z),
+                None => {
+                    let z = self.narrow.get(&(i, j)).map(|narrow| narrow.forward(c, &z)).unwrap_or(z);
+                    self.join[&below].forward(c, &z)
+                }
+            };
+            nodes.insert((i, j), node);
+        }
+        let last = &nodes[&(0, 4)];
+        let full = self.join[&(0, 4)].forward(c, &self.up[&(0, 4)].forward(c, last).upsample_nearest(2));
+        let inputs = [&full, last, &nodes[&(1, 3)], &nodes[&(2, 2)]];
+        self.heads.iter().zip(inputs).map(|(head, x)| head.forward(c, x).sigmoid()).collect()
+    }
+}
+
+/// A 3x3 convolution with bias over mirrored padding; `conv` in a checkpoint.
+fn conv3x3<T: Float>(b: &mut Builder<T>, channels: [usize; 2]) -> Conv {
+    Conv::new(&mut b.at("conv"), channels, 3, Conv2d::padded(1).reflecting(), ConvStart::FanInWithBias)
+}
+
+/// A 3x3 convolution over mirrored padding, and ELU.
+#[derive(Clone, Debug)]
+struct ConvBlock(Conv);
+
+impl ConvBlock {
+    fn new<T: Float>(b: &mut Builder<T>, channels: [usize; 2]) -> Self {
+        ConvBlock(conv3x3(&mut b.at("conv"), channels))
+    }
+
+    fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
+        self.0.forward(c, x).elu()
+    }
+}
+
+/// Channel attention (Hu et al., 1709.01507), then a convolution and ReLU:
+/// z * sigmoid(fc2(relu(fc0(mean of z over the image)))).
+#[derive(Clone, Debug)]
+struct AttentionConv {
+    squeeze: Linear,
+    excite: Linear,
+    conv: Conv,
+}
+
+impl AttentionConv {
+    fn new<T: Float>(b: &mut Builder<T>, channels: [usize; 2], reduction: usize, fc: &str, kernel: usize) -> Self {
+        let [inputs, _] = channels;
+        let hidden = inputs / reduction;
+        let squeeze = Linear::new(&mut b.at(format!("{fc}.0")), [inputs, hidden], Init::FanIn(inputs), false);
+        let excite = Linear::new(&mut b.at(format!("{fc}.2")), [hidden, inputs], Init::FanIn(hidden), false);
+        let op = Conv2d::padded(kernel / 2);
+        let conv = Conv::new(&mut b.at("conv_se"), channels, kernel, op, ConvStart::FanInWithBias);
+        AttentionConv { squeeze, excite, conv }
+    }
+
+    fn forward<T: Float>(&self, c: &Context<T>, z: &Var<T>) -> Var<T> {
+        let [b, _, _, channels] = z.shape().nhwc().expect("an image");
+        let gate = self.excite.forward(c, &self.squeeze.forward(c, &z.mean(1, 2)).relu()).sigmoid();
+        self.conv.forward(c, &(z * gate.reshape([b, 1, 1, channels]))).relu()
+    }
+}

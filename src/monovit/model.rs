@@ -1,0 +1,74 @@
+//! The whole of MonoViT: four networks over one set of parameters.
+
+use super::config::Config;
+use super::decoder::Decoder;
+use super::encoder::Encoder;
+use super::pose::{PoseDecoder, PoseEncoder};
+use crate::nn::{Builder, Context, Params};
+use crate::random::Random;
+use crate::tensor::{Float, Var};
+
+/// Depth encoder and decoder, pose encoder and decoder: `encoder`, `depth`, `pose_encoder`, `pose` in a checkpoint.
+#[derive(Clone, Debug)]
+pub struct MonoVit {
+    /// The sizes.
+    pub config: Config,
+    encoder: Encoder,
+    depth: Decoder,
+    pose_encoder: PoseEncoder,
+    pose: PoseDecoder,
+}
+
+impl MonoVit {
+    /// The networks, and their parameters as they start, drawn from `seed`.
+    pub fn new<T: Float>(config: Config, seed: u64) -> (Self, Params<T>) {
+        let (mut params, mut random) = (Params::new(), Random::new(seed, 0x1417));
+        let b = &mut Builder::new(&mut params, &mut random);
+        let model = MonoVit {
+            encoder: Encoder::new(&mut b.at("encoder"), &config),
+            depth: Decoder::new(&mut b.at("depth"), &config),
+            pose_encoder: PoseEncoder::new(&mut b.at("pose_encoder"), &config),
+            pose: PoseDecoder::new(&mut b.at("pose"), &config),
+            config,
+        };
+        (model, params)
+    }
+
+    /// The encoder's five maps of an image `[B, H, W, 3]` in [0, 1].
+    #[track_caller]
+    pub fn features<T: Float>(&self, c: &Context<T>, image: &Var<T>) -> Vec<Var<T>> {
+        self.encoder.forward(c, image)
+    }
+
+    /// Disparities (sigmoid, in [0, 1]) at 1, 1/2, 1/4, 1/8 of the image, `[B, h, w, 1]` each.
+    #[track_caller]
+    pub fn disparities<T: Float>(&self, c: &Context<T>, image: &Var<T>) -> Vec<Var<T>> {
+        self.depth.forward(c, &self.features(c, image))
+    }
+
+    /// Disparities from the encoder's maps.
+    #[track_caller]
+    pub fn decode<T: Float>(&self, c: &Context<T>, features: &[Var<T>]) -> Vec<Var<T>> {
+        self.depth.forward(c, features)
+    }
+
+    /// Axis-angle and translation, `[B, 6]`, of the camera's motion from the first frame to the second.
+    #[track_caller]
+    pub fn motion<T: Float>(&self, c: &Context<T>, first: &Var<T>, second: &Var<T>) -> Var<T> {
+        self.pose.forward(c, &self.pose_encoder.forward(c, first, second))
+    }
+
+    /// The transforms `[B, 3, 4]` of points of the target camera into the previous and the next one.
+    ///
+    /// The pairs are seen in time order, in two separate passes: (previous, target), whose motion is inverted, then
+    /// (target, next).
+    #[track_caller]
+    pub fn transforms<T: Float>(&self, c: &Context<T>, prev: &Var<T>, target: &Var<T>, next: &Var<T>) -> Vec<Var<T>> {
+        [(prev, target, true), (target, next, false)]
+            .map(|(first, second, invert)| {
+                let motion = self.motion(c, first, second);
+                Var::pose_matrix(&motion.slice(1, 0..3), &motion.slice(1, 3..6), invert)
+            })
+            .into()
+    }
+}

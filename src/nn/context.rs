@@ -1,0 +1,80 @@
+//! One forward pass: the parameters as variables, what is recorded, and the statistics that move.
+
+use std::cell::RefCell;
+use std::collections::HashMap;
+
+use super::params::{ParamId, Params};
+use crate::random::Random;
+use crate::tensor::{Float, Gradients, Tape, Tensor, Var};
+
+/// What a module needs besides its input.
+pub struct Context<T: Float> {
+    vars: Vec<Var<T>>,
+    training: bool,
+    /// Running statistics that this pass has moved; later uses in the same pass go on from here.
+    moved: RefCell<HashMap<ParamId, Tensor<T>>>,
+    /// The dice of DropPath.
+    random: RefCell<Random>,
+}
+
+impl<T: Float> Context<T> {
+    /// Training: parameters are leaves of `tape`, normalisation uses and moves batch statistics.
+    pub fn training(params: &Params<T>, tape: &Tape<T>, random: Random) -> Self {
+        let var = |p: &super::Param<T>| if p.learnt { tape.leaf(p.value.clone()) } else { p.value.clone().into() };
+        Self::with(params.iter().map(|(_, p)| var(p)).collect(), true, random)
+    }
+
+    /// Inference: nothing is recorded, normalisation uses running statistics.
+    pub fn inference(params: &Params<T>) -> Self {
+        Self::with(params.iter().map(|(_, p)| p.value.clone().into()).collect(), false, Random::new(0, 0))
+    }
+
+    fn with(vars: Vec<Var<T>>, training: bool, random: Random) -> Self {
+        Context { vars, training, moved: RefCell::default(), random: RefCell::new(random) }
+    }
+
+    /// A parameter as a variable.
+    pub fn var(&self, id: ParamId) -> &Var<T> {
+        &self.vars[id.0]
+    }
+
+    /// Whether this is training.
+    pub fn is_training(&self) -> bool {
+        self.training
+    }
+
+    /// A running statistic as this pass has left it.
+    pub fn running(&self, id: ParamId) -> Tensor<T> {
+        self.moved.borrow().get(&id).cloned().unwrap_or_else(|| self.vars[id.0].value().clone())
+    }
+
+    /// Moves a running statistic: `(1 - momentum) old + momentum new`.
+    pub fn move_running(&self, id: ParamId, new: &Tensor<T>, momentum: f64) {
+        let mut value = self.running(id);
+        let (keep, take) = (T::of(1.0 - momentum), T::of(momentum));
+        value.data_mut().iter_mut().zip(new.data()).for_each(|(r, &n)| *r = keep * *r + take * n);
+        self.moved.borrow_mut().insert(id, value);
+    }
+
+    /// DropPath: zeroes the whole branch of a sample with probability `p`, and divides the kept ones by 1 - p.
+    pub fn drop_path(&self, x: Var<T>, p: f64) -> Var<T> {
+        if !self.training || p == 0.0 {
+            return x;
+        }
+        let mut dims = vec![1; x.shape().rank()];
+        dims[0] = x.dims()[0];
+        let mut random = self.random.borrow_mut();
+        let mask = (0..dims[0]).map(|_| T::of(if random.unit() < p { 0.0 } else { 1.0 / (1.0 - p) })).collect();
+        x * Var::constant(Tensor::from_vec(&dims, mask))
+    }
+
+    /// Ends the pass: the running statistics it moved.
+    pub fn into_moved(self) -> HashMap<ParamId, Tensor<T>> {
+        self.moved.into_inner()
+    }
+
+    /// The gradient of every parameter that the output depends on.
+    pub fn gradients(&self, gradients: &mut Gradients<T>) -> Vec<Option<Tensor<T>>> {
+        self.vars.iter().map(|v| gradients.take(v)).collect()
+    }
+}

@@ -1,0 +1,114 @@
+//! Convolutions as modules.
+
+use super::{BatchNorm, Builder, Context, Init, Layout, ParamId};
+use crate::ops::Conv2d;
+use crate::ops::batch_norm::Activation;
+use crate::tensor::{Float, Var};
+
+/// A convolution with its weight `[k, k, in, out]` and, optionally, bias `[out]`.
+#[derive(Clone, Debug)]
+pub struct Conv {
+    weight: ParamId,
+    bias: Option<ParamId>,
+    op: Conv2d,
+}
+
+/// How a convolution starts, and whether it has a bias.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ConvStart {
+    /// He's normal by fan out, no bias: in front of a normalisation.
+    He,
+    /// Uniform within 1 / sqrt(fan in), no bias.
+    FanIn,
+    /// Uniform within 1 / sqrt(fan in), the bias too.
+    FanInWithBias,
+}
+
+impl Conv {
+    /// A `kernel` x `kernel` convolution; the parameters stand directly under the builder's path.
+    pub fn new<T: Float>(
+        b: &mut Builder<T>,
+        channels: [usize; 2],
+        kernel: usize,
+        op: Conv2d,
+        start: ConvStart,
+    ) -> Self {
+        let [inputs, outputs] = channels;
+        let fan_in = Init::FanIn(inputs * kernel * kernel);
+        let init = if start == ConvStart::He { Init::he(kernel, outputs) } else { fan_in };
+        let weight = b.param("weight", [kernel, kernel, inputs, outputs], Layout::Conv, init);
+        let bias =
+            (start == ConvStart::FanInWithBias).then(|| b.param("bias", [outputs], Layout::Same, fan_in));
+        Conv { weight, bias, op }
+    }
+
+    /// `[B, H, W, in] -> [B, H', W', out]`.
+    #[track_caller]
+    pub fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
+        x.conv2d(c.var(self.weight), self.bias.map(|b| c.var(b)), self.op)
+    }
+}
+
+/// Convolution without bias, batch normalisation, activation: `conv` and `bn` in a checkpoint.
+#[derive(Clone, Debug)]
+pub struct ConvBn {
+    conv: Conv,
+    bn: BatchNorm,
+}
+
+impl ConvBn {
+    /// A `kernel` x `kernel` convolution with zero padding of half the kernel.
+    pub fn new<T: Float>(
+        b: &mut Builder<T>,
+        channels: [usize; 2],
+        kernel: usize,
+        stride: usize,
+        activation: Activation,
+    ) -> Self {
+        let op = Conv2d::padded(kernel / 2).strided(stride);
+        let conv = Conv::new(&mut b.at("conv"), channels, kernel, op, ConvStart::He);
+        ConvBn { conv, bn: BatchNorm::new(&mut b.at("bn"), channels[1], activation) }
+    }
+
+    /// `[B, H, W, in] -> [B, H / stride, W / stride, out]`.
+    #[track_caller]
+    pub fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
+        self.bn.forward(c, &self.conv.forward(c, x))
+    }
+}
+
+/// A depthwise convolution with zero padding of half its window: weight `[k, k, channels]`, optionally bias.
+#[derive(Clone, Debug)]
+pub struct DepthwiseConv {
+    weight: ParamId,
+    bias: Option<ParamId>,
+    kernel: usize,
+    stride: usize,
+}
+
+impl DepthwiseConv {
+    /// The parameters stand directly under the builder's path.
+    pub fn new<T: Float>(
+        b: &mut Builder<T>,
+        channels: usize,
+        kernel: usize,
+        stride: usize,
+        init: Init,
+        bias: bool,
+    ) -> Self {
+        let weight = b.param("weight", [kernel, kernel, channels], Layout::Depthwise, init);
+        let bias = bias.then(|| b.param("bias", [channels], Layout::Same, init));
+        DepthwiseConv { weight, bias, kernel, stride }
+    }
+
+    /// `[B, H, W, C] -> [B, H / stride, W / stride, C]`.
+    #[track_caller]
+    pub fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
+        x.depthwise_conv2d(c.var(self.weight), self.bias.map(|b| c.var(b)), self.stride, self.kernel / 2)
+    }
+
+    /// Its weight, and its bias if it has one.
+    pub fn params(&self) -> (ParamId, Option<ParamId>) {
+        (self.weight, self.bias)
+    }
+}

@@ -1,0 +1,42 @@
+//! How parameters start.
+
+use crate::random::Random;
+use crate::tensor::{Float, Shape, Tensor};
+
+/// A distribution to draw the starting values from.
+#[derive(Clone, Copy, Debug)]
+pub enum Init {
+    /// The same number everywhere.
+    Constant(f64),
+    /// Normal with mean 0.
+    Normal(f64),
+    /// Normal with mean 0, drawn again where it is more than two (absolute) away: at these deviations, never.
+    TruncatedNormal(f64),
+    /// Uniform within 1 / sqrt(fan in), which is given.
+    FanIn(usize),
+}
+
+impl Init {
+    /// He's normal for a convolution, by fan out: deviation sqrt(2 / (kh kw out)).
+    pub fn he(kernel: usize, out: usize) -> Self {
+        Init::Normal((2.0 / (kernel * kernel * out) as f64).sqrt())
+    }
+
+    pub(super) fn tensor<T: Float>(self, shape: Shape, random: &mut Random) -> Tensor<T> {
+        let mut draw = || match self {
+            Init::Constant(value) => value,
+            Init::Normal(deviation) => deviation * random.normal(),
+            Init::TruncatedNormal(deviation) => loop {
+                let x = deviation * random.normal();
+                if x.abs() <= 2.0 {
+                    break x;
+                }
+            },
+            Init::FanIn(fan_in) => {
+                let bound = 1.0 / (fan_in as f64).sqrt();
+                random.uniform(-bound, bound)
+            }
+        };
+        Tensor::build(shape, |out| out.iter_mut().for_each(|x| *x = T::of(draw())))
+    }
+}

@@ -1,0 +1,26 @@
+//! The linear layer as a module.
+
+use super::{Builder, Context, Init, Layout, ParamId};
+use crate::tensor::{Float, Var};
+
+/// `y = x w (+ b)`, weight `[in, out]`.
+#[derive(Clone, Debug)]
+pub struct Linear {
+    weight: ParamId,
+    bias: Option<ParamId>,
+}
+
+impl Linear {
+    /// The parameters stand directly under the builder's path. A bias starts at 0.
+    pub fn new<T: Float>(b: &mut Builder<T>, channels: [usize; 2], init: Init, bias: bool) -> Self {
+        let weight = b.param("weight", channels, Layout::Linear, init);
+        let bias = bias.then(|| b.param("bias", [channels[1]], Layout::Same, Init::Constant(0.0)));
+        Linear { weight, bias }
+    }
+
+    /// `[.., in] -> [.., out]`.
+    #[track_caller]
+    pub fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
+        x.linear(c.var(self.weight), self.bias.map(|b| c.var(b)))
+    }
+}

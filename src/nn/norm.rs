@@ -1,0 +1,78 @@
+//! Normalisations as modules.
+
+use super::{Builder, Context, Init, Layout, ParamId};
+use crate::ops::batch_norm::Activation;
+use crate::tensor::{Float, Tensor, Var};
+
+/// Batch normalisation (Ioffe and Szegedy, 1502.03167) over all but the channels, with an activation behind it.
+///
+/// Training uses the batch's mean and biased variance, and moves the running ones by a tenth (the unbiased variance);
+/// evaluation uses the running ones.
+#[derive(Clone, Debug)]
+pub struct BatchNorm {
+    weight: ParamId,
+    bias: ParamId,
+    running_mean: ParamId,
+    running_var: ParamId,
+    activation: Activation,
+}
+
+impl BatchNorm {
+    /// Added to the variance under the root.
+    pub const EPS: f64 = 1e-5;
+    /// The share of a new batch in the running statistics.
+    pub const MOMENTUM: f64 = 0.1;
+
+    /// The parameters stand directly under the builder's path.
+    pub fn new<T: Float>(b: &mut Builder<T>, channels: usize, activation: Activation) -> Self {
+        BatchNorm {
+            weight: b.param("weight", [channels], Layout::Same, Init::Constant(1.0)),
+            bias: b.param("bias", [channels], Layout::Same, Init::Constant(0.0)),
+            running_mean: b.buffer("running_mean", [channels], 0.0),
+            running_var: b.buffer("running_var", [channels], 1.0),
+            activation,
+        }
+    }
+
+    /// `[.., C] -> [.., C]`.
+    #[track_caller]
+    pub fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
+        let (weight, bias) = (c.var(self.weight), c.var(self.bias));
+        if !c.is_training() {
+            let (mean, var) = (c.var(self.running_mean), c.var(self.running_var));
+            return x.batch_norm_eval(weight, bias, mean, var, Self::EPS, self.activation);
+        }
+        let (y, mean, var) = x.batch_norm(weight, bias, Self::EPS, self.activation);
+        let n = x.shape().rows() as f64;
+        let unbiased: Tensor<T> = var.map(|v| v * T::of(n / (n - 1.0).max(1.0)));
+        c.move_running(self.running_mean, &mean, Self::MOMENTUM);
+        c.move_running(self.running_var, &unbiased, Self::MOMENTUM);
+        y
+    }
+}
+
+/// Layer normalisation (Ba et al., 1607.06450) over the channels of each token.
+#[derive(Clone, Debug)]
+pub struct LayerNorm {
+    weight: ParamId,
+    bias: ParamId,
+}
+
+impl LayerNorm {
+    /// Added to the variance under the root.
+    pub const EPS: f64 = 1e-6;
+
+    /// The parameters stand directly under the builder's path.
+    pub fn new<T: Float>(b: &mut Builder<T>, channels: usize) -> Self {
+        LayerNorm {
+            weight: b.param("weight", [channels], Layout::Same, Init::Constant(1.0)),
+            bias: b.param("bias", [channels], Layout::Same, Init::Constant(0.0)),
+        }
+    }
+
+    /// `[.., C] -> [.., C]`.
+    #[track_caller]
+    pub fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
+        x.layer_norm(c.var(self.weight), c.var(self.bias), Self::EPS)
+    }
+}

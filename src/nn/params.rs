@@ -1,0 +1,201 @@
+//! Parameters and buffers by path, with the names, shapes and layouts of the public checkpoints.
+
+use std::collections::HashMap;
+
+use super::init::Init;
+use crate::random::Random;
+use crate::tensor::{Float, Shape, Tensor};
+
+/// Which parameter: an index into [`Params`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct ParamId(pub(crate) usize);
+
+/// How a tensor lies in a PyTorch checkpoint, beside how it lies here.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Layout {
+    /// The same.
+    Same,
+    /// `[out, in / groups, kh, kw]` there, `[kh, kw, in / groups, out]` here.
+    Conv,
+    /// `[channels, 1, kh, kw]` there, `[kh, kw, channels]` here.
+    Depthwise,
+    /// `[out, in]` there, `[in, out]` here.
+    Linear,
+}
+
+impl Layout {
+    /// A tensor in this crate's layout from one in PyTorch's; `None` if its rank is wrong.
+    pub fn import<T: Float>(self, theirs: &Tensor<T>) -> Option<Tensor<T>> {
+        Some(match (self, theirs.dims()) {
+            (Layout::Same, _) => theirs.clone(),
+            (Layout::Conv, [_, _, _, _]) => theirs.permute(&[2, 3, 1, 0]),
+            (Layout::Depthwise, &[c, 1, kh, kw]) => theirs.reshape([c, kh, kw]).permute(&[1, 2, 0]),
+            (Layout::Linear, [_, _]) => theirs.permute(&[1, 0]),
+            _ => return None,
+        })
+    }
+
+    /// A tensor in PyTorch's layout from one in this crate's.
+    pub fn export<T: Float>(self, ours: &Tensor<T>) -> Tensor<T> {
+        match (self, ours.dims()) {
+            (Layout::Conv, _) => ours.permute(&[3, 2, 0, 1]),
+            (Layout::Depthwise, &[kh, kw, c]) => ours.permute(&[2, 0, 1]).reshape([c, 1, kh, kw]),
+            (Layout::Linear, _) => ours.permute(&[1, 0]),
+            _ => ours.clone(),
+        }
+    }
+}
+
+/// One named tensor of a model.
+#[derive(Clone, Debug)]
+pub struct Param<T: Float> {
+    /// Its names in a checkpoint: several where modules share it, the first one its own.
+    pub names: Vec<String>,
+    /// The numbers, in this crate's layout.
+    pub value: Tensor<T>,
+    /// How it lies in a PyTorch checkpoint.
+    pub layout: Layout,
+    /// Whether it is learnt (a weight), or kept (a running statistic).
+    pub learnt: bool,
+}
+
+impl<T: Float> Param<T> {
+    /// Its own name.
+    pub fn name(&self) -> &str {
+        &self.names[0]
+    }
+}
+
+/// All the tensors of a model.
+#[derive(Clone, Debug, Default)]
+pub struct Params<T: Float> {
+    all: Vec<Param<T>>,
+    by_name: HashMap<String, ParamId>,
+}
+
+impl<T: Float> Params<T> {
+    /// No tensors.
+    pub fn new() -> Self {
+        Params { all: Vec::new(), by_name: HashMap::new() }
+    }
+
+    /// Every tensor, in the order in which modules asked for them.
+    pub fn iter(&self) -> impl ExactSizeIterator<Item = (ParamId, &Param<T>)> {
+        self.all.iter().enumerate().map(|(i, p)| (ParamId(i), p))
+    }
+
+    /// How many there are.
+    pub fn len(&self) -> usize {
+        self.all.len()
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.all.is_empty()
+    }
+
+    /// One of them.
+    pub fn get(&self, id: ParamId) -> &Param<T> {
+        &self.all[id.0]
+    }
+
+    /// The numbers of one of them, to be changed.
+    pub fn value_mut(&mut self, id: ParamId) -> &mut Tensor<T> {
+        &mut self.all[id.0].value
+    }
+
+    /// Replaces the numbers of one of them.
+    ///
+    /// # Panics
+    /// If the shape differs.
+    #[track_caller]
+    pub fn set(&mut self, id: ParamId, value: Tensor<T>) {
+        let param = &mut self.all[id.0];
+        assert_eq!(param.value.shape(), value.shape(), "{}", param.name());
+        param.value = value;
+    }
+
+    /// The tensor with this name (any of its names).
+    pub fn find(&self, name: &str) -> Option<ParamId> {
+        self.by_name.get(name).copied()
+    }
+
+    /// How many numbers are learnt under names that begin with `prefix`.
+    pub fn count(&self, prefix: &str) -> usize {
+        self.all.iter().filter(|p| p.learnt && p.name().starts_with(prefix)).map(|p| p.value.len()).sum()
+    }
+
+    /// The same model in the other element type.
+    pub fn cast<U: Float>(&self) -> Params<U> {
+        let all = self.all.iter().map(|p| Param {
+            names: p.names.clone(),
+            value: p.value.cast(),
+            layout: p.layout,
+            learnt: p.learnt,
+        });
+        Params { all: all.collect(), by_name: self.by_name.clone() }
+    }
+
+    #[track_caller]
+    fn add(&mut self, param: Param<T>) -> ParamId {
+        let id = ParamId(self.all.len());
+        let before = self.by_name.insert(param.name().to_owned(), id);
+        assert!(before.is_none(), "two parameters are called {}", param.name());
+        self.all.push(param);
+        id
+    }
+
+    #[track_caller]
+    fn alias(&mut self, id: ParamId, name: String) {
+        let before = self.by_name.insert(name.clone(), id);
+        assert!(before.is_none(), "two parameters are called {name}");
+        self.all[id.0].names.push(name);
+    }
+}
+
+/// Makes parameters as modules ask for them, under a path that grows with [`Builder::at`].
+pub struct Builder<'a, T: Float> {
+    params: &'a mut Params<T>,
+    random: &'a mut Random,
+    path: String,
+}
+
+impl<'a, T: Float> Builder<'a, T> {
+    /// A builder at the root.
+    pub fn new(params: &'a mut Params<T>, random: &'a mut Random) -> Self {
+        Builder { params, random, path: String::new() }
+    }
+
+    /// The same builder one level deeper.
+    pub fn at(&mut self, name: impl std::fmt::Display) -> Builder<'_, T> {
+        let path = self.join(name);
+        Builder { params: self.params, random: self.random, path }
+    }
+
+    fn join(&self, name: impl std::fmt::Display) -> String {
+        if self.path.is_empty() { name.to_string() } else { format!("{}.{name}", self.path) }
+    }
+
+    /// A tensor that is learnt, filled by `init`.
+    #[track_caller]
+    pub fn param(&mut self, name: &str, shape: impl Into<Shape>, layout: Layout, init: Init) -> ParamId {
+        let names = vec![self.join(name)];
+        let value = init.tensor(shape.into(), self.random);
+        self.params.add(Param { names, value, layout, learnt: true })
+    }
+
+    /// A tensor that is kept but not learnt.
+    #[track_caller]
+    pub fn buffer(&mut self, name: &str, shape: impl Into<Shape>, value: f64) -> ParamId {
+        let names = vec![self.join(name)];
+        let value = Tensor::full(shape, T::of(value));
+        self.params.add(Param { names, value, layout: Layout::Same, learnt: false })
+    }
+
+    /// One more name for a tensor that modules share.
+    #[track_caller]
+    pub fn alias(&mut self, name: &str, id: ParamId) {
+        let name = self.join(name);
+        self.params.alias(id, name);
+    }
+}

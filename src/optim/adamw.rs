@@ -1,0 +1,99 @@
+//! AdamW (Loshchilov and Hutter, 1711.05101): Adam with decoupled weight decay.
+
+use crate::nn::Params;
+use crate::tensor::{Float, Tensor, parallel, simd};
+
+/// The settings of a group of parameters.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Group {
+    /// The learning rate.
+    pub learning_rate: f64,
+    /// The decay: each step shrinks a weight by `learning_rate * decay` of itself.
+    pub decay: f64,
+}
+
+/// The optimiser's state: first and second moments of every parameter's gradient.
+///
+/// With bias correction, for gradient g at step t:
+/// m = b1 m + (1 - b1) g, v = b2 v + (1 - b2) g^2,
+/// w = w (1 - lr decay) - lr (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + eps).
+/// A parameter without a gradient is not touched, not even by the decay.
+#[derive(Clone, Debug)]
+pub struct AdamW<T: Float> {
+    /// b1 and b2.
+    pub betas: [f64; 2],
+    /// Added to the root.
+    pub eps: f64,
+    /// m and v, in the order of the parameters; none yet for a parameter that had no gradient.
+    pub moments: Vec<Option<[Tensor<T>; 2]>>,
+    /// Steps taken.
+    pub steps: u64,
+}
+
+impl<T: Float> AdamW<T> {
+    /// No steps taken, betas 0.9 and 0.999, eps 1e-8.
+    pub fn new(params: &Params<T>) -> Self {
+        AdamW { betas: [0.9, 0.999], eps: 1e-8, moments: vec![None; params.len()], steps: 0 }
+    }
+
+    /// One step. `gradients` are in the order of the parameters; `group` gives each parameter's settings by its name.
+    ///
+    /// # Panics
+    /// If a gradient has another shape than its parameter.
+    pub fn step(&mut self, params: &mut Params<T>, gradients: &[Option<Tensor<T>>], group: impl Fn(&str) -> Group) {
+        self.steps += 1;
+        let [b1, b2] = self.betas;
+        let correct = |b: f64| 1.0 - b.powi(self.steps.min(i32::MAX as u64) as i32);
+        let (root2, eps) = (T::of(correct(b2).sqrt()), T::of(self.eps));
+        let groups: Vec<Group> = params.iter().map(|(_, p)| group(p.name())).collect();
+        let ids: Vec<_> = params.iter().map(|(id, _)| id).collect();
+        for (i, gradient) in gradients.iter().enumerate() {
+            let Some(g) = gradient else { continue };
+            let weights = params.value_mut(ids[i]);
+            assert_eq!(weights.shape(), g.shape(), "a gradient has the shape of its parameter");
+            let zeros = || Tensor::zeros(*g.shape());
+            let [m, v] = self.moments[i].get_or_insert_with(|| [zeros(), zeros()]);
+            let Group { learning_rate: lr, decay } = groups[i];
+            let (keep, rate) = (T::of(1.0 - lr * decay), T::of(lr / correct(b1)));
+            let (b1, b2, c1, c2) = (T::of(b1), T::of(b2), T::of(1.0 - b1), T::of(1.0 - b2));
+            let pieces = weights.data_mut().chunks_mut(CHUNK).zip(g.data().chunks(CHUNK));
+            let pieces = pieces.zip(m.data_mut().chunks_mut(CHUNK).zip(v.data_mut().chunks_mut(CHUNK)));
+            parallel::for_each_piece(pieces, 8 * g.len(), |((w, g), (m, v))| {
+                simd::dispatch(
+                    #[inline(always)]
+                    || {
+                        for ((w, &g), (m, v)) in w.iter_mut().zip(g).zip(m.iter_mut().zip(v)) {
+                            *m = b1 * *m + c1 * g;
+                            *v = b2 * *v + c2 * (g * g);
+                            *w = *w * keep - rate * *m / (v.sqrt() / root2 + eps);
+                        }
+                    },
+                );
+            });
+        }
+    }
+}
+
+/// Elements handed to a thread at a time.
+const CHUNK: usize = 1 << 14;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::nn::{Builder, Init, Layout};
+    use crate::random::Random;
+
+    #[test]
+    fn the_first_step_is_the_learning_rate_against_the_gradients_sign() {
+        let mut params = Params::<f64>::new();
+        let mut random = Random::new(0, 0);
+        let id = Builder::new(&mut params, &mut random).param("w", [2], Layout::Same, Init::Constant(1.0));
+        let idle = Builder::new(&mut params, &mut random).param("idle", [1], Layout::Same, Init::Constant(1.0));
+        let mut adamw = AdamW::new(&params);
+        let gradients = [Some(Tensor::from_vec([2], vec![3.0, -0.01])), None];
+        adamw.step(&mut params, &gradients, |_| Group { learning_rate: 0.1, decay: 0.5 });
+        let w = params.get(id).value.data();
+        assert!((w[0] - (0.95 - 0.1)).abs() < 1e-6 && (w[1] - (0.95 + 0.1)).abs() < 1e-6, "{w:?}");
+        assert_eq!(params.get(idle).value.item(), 1.0, "no gradient, no step, no decay");
+    }
+}

@@ -1,0 +1,39 @@
+//! An exponential moving average of the weights: smoother than the last step, and often better.
+
+use crate::nn::Params;
+use crate::tensor::{Float, Tensor};
+
+/// The average of every tensor of a model (running statistics too), with a decay that warms up with the step:
+/// min(decay, (1 + t) / (10 + t)).
+#[derive(Clone, Debug)]
+pub struct Average<T: Float> {
+    /// The share of the old average in the new one, once warm.
+    pub decay: f64,
+    /// The averages, in the order of the parameters.
+    pub values: Vec<Tensor<T>>,
+}
+
+impl<T: Float> Average<T> {
+    /// Starts at the weights as they are.
+    pub fn new(params: &Params<T>, decay: f64) -> Self {
+        Average { decay, values: params.iter().map(|(_, p)| p.value.clone()).collect() }
+    }
+
+    /// Takes in the weights after step `t`.
+    pub fn update(&mut self, params: &Params<T>, t: u64) {
+        let decay = self.decay.min((1.0 + t as f64) / (10.0 + t as f64));
+        let take = T::of(1.0 - decay);
+        for (average, (_, p)) in self.values.iter_mut().zip(params.iter()) {
+            average.data_mut().iter_mut().zip(p.value.data()).for_each(|(a, &w)| *a += take * (w - *a));
+        }
+    }
+
+    /// The model with the averages for weights.
+    pub fn params(&self, params: &Params<T>) -> Params<T> {
+        let mut averaged = params.clone();
+        for (value, (id, _)) in self.values.iter().zip(params.iter()) {
+            averaged.set(id, value.clone());
+        }
+        averaged
+    }
+}
