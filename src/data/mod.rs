@@ -3,12 +3,15 @@
 use std::sync::Arc;
 
 use image::RgbImage;
+use serde::{Deserialize, Serialize};
 
 use crate::Result;
 
+pub mod street;
+
 /// Pinhole intrinsics in units of the image size, so that they hold at any resolution:
 /// `u = fx * W * x/z + cx * W`, `v = fy * H * y/z + cy * H`, pixel centres at whole numbers.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Intrinsics {
     /// Focal length over the width.
     pub fx: f64,

@@ -1,0 +1,144 @@
+//! The camera: where a car carries it along the street, and how it turns pixels into rays.
+
+use super::StreetConfig;
+use super::draw::Draw;
+
+/// Where a camera is: camera-to-world, in metres; x right, y down, z forward in both frames.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Pose {
+    /// Rotation from the camera's axes to the world's, row-major; its columns are the camera's axes in the world.
+    pub rotation: [[f64; 3]; 3],
+    /// The camera's centre in the world, in metres.
+    pub position: [f64; 3],
+}
+
+impl Pose {
+    /// A camera at `position`, turned right by `yaw` and then up by `pitch` (radians).
+    pub fn new(position: [f64; 3], yaw: f64, pitch: f64) -> Self {
+        let (sy, cy) = (libm::sin(yaw), libm::cos(yaw));
+        let (sp, cp) = (libm::sin(pitch), libm::cos(pitch));
+        Pose { rotation: [[cy, sy * sp, sy * cp], [0.0, cp, -sp], [-sy, cy * sp, cy * cp]], position }
+    }
+
+    /// The rows `[R | C]` of the 3x4 camera-to-world matrix.
+    pub fn matrix(&self) -> [[f64; 4]; 3] {
+        std::array::from_fn(|i| {
+            let r = self.rotation[i];
+            [r[0], r[1], r[2], self.position[i]]
+        })
+    }
+
+    /// The rows `[R | t]` that map a point of this camera to one of `other`: `other^-1 * self`.
+    pub fn relative_to(&self, other: &Pose) -> [[f64; 4]; 3] {
+        let (a, b) = (&self.rotation, &other.rotation);
+        std::array::from_fn(|i| {
+            std::array::from_fn(|j| {
+                let column = |k: usize| if j < 3 { a[k][j] } else { self.position[k] - other.position[k] };
+                (0..3).map(|k| b[k][i] * column(k)).sum()
+            })
+        })
+    }
+
+    /// A world point in this camera's frame.
+    pub(crate) fn to_camera(self, point: [f64; 3]) -> [f64; 3] {
+        let d: [f64; 3] = std::array::from_fn(|k| point[k] - self.position[k]);
+        std::array::from_fn(|i| (0..3).map(|k| self.rotation[k][i] * d[k]).sum())
+    }
+}
+
+/// How far a car may travel in one frame, in metres.
+pub(crate) const FASTEST: f64 = 1.0;
+/// How far the camera strays from the middle of its lane, in metres, before the driver corrects in earnest.
+const LANE: f64 = 1.0;
+
+/// The path of a car for `frames` frames: 0.5 to 1 m a frame with slow changes of speed, gentle steering that holds the
+/// lane, and a little pitch. With `keep_right` it stays off the oncoming traffic.
+pub(crate) fn drive(draw: &mut Draw, frames: usize, keep_right: bool) -> Vec<Pose> {
+    let mut x = if keep_right { draw.range(0.2, 0.8) } else { draw.range(-0.8, 0.8) };
+    let goal = if keep_right { 0.4 } else { draw.range(-0.3, 0.3) };
+    let mut z = 0.0;
+    let mut yaw = draw.range(-0.03, 0.03);
+    let (mut turn, mut surge) = (0.0, 0.0);
+    let cruise = draw.range(0.55, 0.95);
+    let mut poses = Vec::with_capacity(frames);
+    for _ in 0..frames {
+        // The yaw rate forgets, and is drawn back to the street's direction and to the lane.
+        let strayed = (x - goal) - (x - goal).clamp(-LANE, LANE);
+        turn = 0.8 * turn + draw.normal(0.004) - 0.02 * yaw - 0.002 * (x - goal) - 0.03 * strayed;
+        yaw = (yaw + turn).clamp(-0.12, 0.12);
+        let pose = Pose::new([x, 0.0, z], yaw, draw.normal(0.002));
+        poses.push(pose);
+        surge = 0.9 * surge + draw.normal(0.015);
+        let speed = (cruise + surge).clamp(0.5, FASTEST);
+        x += pose.rotation[0][2] * speed;
+        z += pose.rotation[2][2] * speed;
+    }
+    poses
+}
+
+/// A posed pinhole camera of a given picture size. A pixel `(u, v)`, centres at whole numbers, sees along
+/// `R ((u - cx)/fx, (v - cy)/fy, 1)`, so the parameter along the ray *is* the depth.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct View {
+    pub(crate) pose: Pose,
+    pub(crate) width: usize,
+    pub(crate) height: usize,
+    /// Focal lengths and principal point, in pixels.
+    pub(crate) focal: [f64; 2],
+    pub(crate) centre: [f64; 2],
+}
+
+impl View {
+    /// The camera of a configuration at `pose`.
+    pub(crate) fn new(config: &StreetConfig, pose: Pose) -> Self {
+        let (w, h, k) = (config.width as f64, config.height as f64, config.intrinsics);
+        let (focal, centre) = ([k.fx * w, k.fy * h], [k.cx * w, k.cy * h]);
+        View { pose, width: config.width, height: config.height, focal, centre }
+    }
+
+    /// The camera's x, y and z axes in the world.
+    pub(crate) fn axes(&self) -> [[f32; 3]; 3] {
+        std::array::from_fn(|j| std::array::from_fn(|i| self.pose.rotation[i][j] as f32))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn poses_are_rotations_and_the_car_stays_in_its_lane() {
+        for seed in 0..20 {
+            let path = drive(&mut Draw::new(seed, 0, 0), 500, seed % 2 == 0);
+            for pair in path.windows(2) {
+                let (a, b) = (pair[0], pair[1]);
+                let step = ((b.position[0] - a.position[0]).powi(2) + (b.position[2] - a.position[2]).powi(2)).sqrt();
+                assert!((0.499..1.001).contains(&step), "{step}");
+                assert!(b.position[0].abs() < 2.0, "{:?}", b.position);
+            }
+            for pose in &path {
+                let r = pose.rotation;
+                for i in 0..3 {
+                    for j in 0..3 {
+                        let dot: f64 = (0..3).map(|k| r[k][i] * r[k][j]).sum();
+                        assert!((dot - (i == j) as u8 as f64).abs() < 1e-12);
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_relative_pose_carries_points_from_camera_to_camera() {
+        let a = Pose::new([0.3, 0.0, 4.0], 0.05, 0.01);
+        let b = Pose::new([-0.2, 0.1, 5.0], -0.03, -0.02);
+        let world = [1.0, -2.0, 20.0];
+        let (pa, pb) = (a.to_camera(world), b.to_camera(world));
+        let m = a.relative_to(&b);
+        for i in 0..3 {
+            let moved = m[i][0] * pa[0] + m[i][1] * pa[1] + m[i][2] * pa[2] + m[i][3];
+            assert!((moved - pb[i]).abs() < 1e-12);
+        }
+        assert!(Pose::new([0.0; 3], 0.0, 0.1).rotation[1][2] < 0.0, "a positive pitch looks up: y points down");
+    }
+}

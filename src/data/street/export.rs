@@ -1,0 +1,138 @@
+//! Writes a street as files in the layout of KITTI raw, so that any reader of KITTI can take it.
+//!
+//! ```text
+//! OUT/2011_09_26/calib_cam_to_cam.txt
+//! OUT/2011_09_26/2011_09_26_drive_0000_sync/image_02/data/0000000000.png
+//! OUT/2011_09_26/2011_09_26_drive_0000_sync/proj_depth/groundtruth/image_02/0000000000.png
+//! OUT/2011_09_26/2011_09_26_drive_0000_sync/poses.txt
+//! OUT/splits/train_files.txt
+//! ```
+
+use std::fs;
+use std::path::Path;
+
+use image::{ImageBuffer, Luma};
+
+use super::{Pose, Street, StreetConfig};
+use crate::{Error, Result};
+
+/// The day under which all drives are filed.
+const DAY: &str = "2011_09_26";
+/// Depth is clipped here, in metres: the 16-bit files hold metres times 256.
+const DEEPEST: f32 = 250.0;
+
+/// Writes the pictures (8-bit PNG), exact depth (16-bit PNG, metres times 256, 0 for the sky), camera-to-world poses
+/// (`poses.txt`: the twelve numbers of `[R | C]`, a line a frame), the calibration and a split file with every frame
+/// that has both neighbours. Refuses a folder that exists and is not empty.
+pub fn write(street: &Street, out: &Path) -> Result<()> {
+    if let Ok(mut entries) = fs::read_dir(out) {
+        if entries.next().is_some() {
+            let message = "the folder is not empty; give a new one, or empty it first: nothing was written";
+            return Err(Error::file(out, message));
+        }
+    }
+    let config = street.config();
+    let day = out.join(DAY);
+    folder(&day)?;
+    text(&day.join("calib_cam_to_cam.txt"), &calibration(config))?;
+    let mut split = String::new();
+    for sequence in 0..config.sequences {
+        let name = format!("{DAY}_drive_{sequence:04}_sync");
+        let drive = day.join(&name);
+        let (images, depths) = (drive.join("image_02/data"), drive.join("proj_depth/groundtruth/image_02"));
+        folder(&images)?;
+        folder(&depths)?;
+        for frame in 0..config.frames {
+            let file = format!("{frame:010}.png");
+            let path = images.join(&file);
+            street.frame(sequence, frame).save(&path).map_err(|e| Error::file(&path, e.to_string()))?;
+            let path = depths.join(&file);
+            let depth = street.frame_depth(sequence, frame);
+            let raw: Vec<u16> = depth.metres.iter().map(|z| (z.min(DEEPEST) * 256.0 + 0.5) as u16).collect();
+            let picture = ImageBuffer::<Luma<u16>, _>::from_raw(depth.width as u32, depth.height as u32, raw);
+            let picture = picture.ok_or_else(|| Error::Failed("a depth map has too few values".to_owned()))?;
+            picture.save(&path).map_err(|e| Error::file(&path, e.to_string()))?;
+            if frame > 0 && frame + 1 < config.frames {
+                split += &format!("{DAY}/{name} {frame} l\n");
+            }
+        }
+        let poses: String = street.poses(sequence).iter().map(line).collect();
+        text(&drive.join("poses.txt"), &poses)?;
+    }
+    folder(&out.join("splits"))?;
+    text(&out.join("splits/train_files.txt"), &split)
+}
+
+fn folder(path: &Path) -> Result<()> {
+    fs::create_dir_all(path).map_err(|e| Error::io(path, e))
+}
+
+fn text(path: &Path, content: &str) -> Result<()> {
+    fs::write(path, content).map_err(|e| Error::io(path, e))
+}
+
+/// A pose as twelve numbers that read back exactly.
+fn line(pose: &Pose) -> String {
+    let numbers: Vec<String> = pose.matrix().iter().flatten().map(|x| format!("{x:?}")).collect();
+    numbers.join(" ") + "\n"
+}
+
+/// The entries of KITTI's calibration that readers use, for the left colour camera.
+fn calibration(config: &StreetConfig) -> String {
+    let (w, h, k) = (config.width as f64, config.height as f64, config.intrinsics);
+    let (fx, fy, cx, cy) = (k.fx * w, k.fy * h, k.cx * w, k.cy * h);
+    format!(
+        "calib_time: 26-Sep-2011 00:00:00\n\
+         corner_dist: 1.000000e+00\n\
+         S_02: {w:?} {h:?}\n\
+         K_02: {fx:?} 0.0 {cx:?} 0.0 {fy:?} {cy:?} 0.0 0.0 1.0\n\
+         D_02: 0.0 0.0 0.0 0.0 0.0\n\
+         R_02: 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0\n\
+         T_02: 0.0 0.0 0.0\n\
+         R_rect_00: 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0\n\
+         S_rect_02: {w:?} {h:?}\n\
+         R_rect_02: 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0\n\
+         P_rect_02: {fx:?} 0.0 {cx:?} 0.0 0.0 {fy:?} {cy:?} 0.0 0.0 0.0 1.0 0.0\n"
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::data::Dataset;
+
+    #[test]
+    fn files_say_what_was_rendered_and_nothing_is_overwritten() {
+        let config = StreetConfig { height: 24, width: 64, sequences: 2, frames: 4, ..StreetConfig::default() };
+        let street = Street::render(&config, None);
+        let dir = tempfile::tempdir().unwrap();
+        let out = dir.path().join("street");
+        write(&street, &out).unwrap();
+
+        let split = fs::read_to_string(out.join("splits/train_files.txt")).unwrap();
+        assert_eq!(split.lines().count(), street.len());
+        assert_eq!(split.lines().nth(3), Some("2011_09_26/2011_09_26_drive_0001_sync 2 l"));
+
+        let drive = out.join("2011_09_26/2011_09_26_drive_0001_sync");
+        let image = image::open(drive.join("image_02/data/0000000003.png")).unwrap().into_rgb8();
+        assert_eq!(&image, street.frame(1, 3).as_ref());
+        let raw = image::open(drive.join("proj_depth/groundtruth/image_02/0000000003.png")).unwrap().into_luma16();
+        let depth = street.frame_depth(1, 3);
+        for (&raw, &z) in raw.as_raw().iter().zip(&depth.metres) {
+            assert!((raw as f32 / 256.0 - z).abs() <= 0.5 / 256.0 && (raw == 0) == (z == 0.0));
+        }
+        let poses = fs::read_to_string(drive.join("poses.txt")).unwrap();
+        for (line, pose) in poses.lines().zip(street.poses(1)) {
+            let numbers: Vec<f64> = line.split(' ').map(|x| x.parse().unwrap()).collect();
+            assert_eq!(numbers, pose.matrix().concat());
+        }
+        let calibration = fs::read_to_string(out.join("2011_09_26/calib_cam_to_cam.txt")).unwrap();
+        let projection = calibration.lines().find_map(|l| l.strip_prefix("P_rect_02: ")).unwrap();
+        let projection: Vec<f64> = projection.split(' ').map(|x| x.parse().unwrap()).collect();
+        assert_eq!(projection.len(), 12);
+        assert!((projection[0] - 0.58 * 64.0).abs() < 1e-9 && (projection[6] - 12.0).abs() < 1e-9);
+
+        let again = write(&street, &out).unwrap_err().to_string();
+        assert!(again.contains("not empty") && again.contains("street"), "{again}");
+    }
+}
