@@ -3,7 +3,11 @@
 #![deny(unsafe_code)]
 
 pub mod data;
-pub mod report;
 mod error;
+pub mod files;
+pub mod monovit;
+pub mod report;
+#[cfg(test)]
+mod test_support;
 
 pub use error::{Error, Result};

@@ -1,5 +1,11 @@
 //! Where frames come from: the embedded street, KITTI raw, folders; and what is done to them before training.
 
+pub mod augment;
+pub mod kitti;
+pub mod picture;
+pub mod pyramid;
+pub mod resize;
+
 use std::sync::Arc;
 
 use image::RgbImage;
@@ -22,7 +28,12 @@ pub struct Intrinsics {
 
 impl Intrinsics {
     /// The published constants for KITTI: fx 0.58 W, fy 1.92 H, the centre in the middle.
-    pub const KITTI: Intrinsics = Intrinsics { fx: 0.58, fy: 1.92, cx: 0.5, cy: 0.5 };
+    pub const KITTI: Intrinsics = Intrinsics {
+        fx: 0.58,
+        fy: 1.92,
+        cx: 0.5,
+        cy: 0.5,
+    };
 }
 
 /// A map of metric depth (camera z, metres), row-major, 0 where nothing is known.
