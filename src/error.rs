@@ -42,25 +42,16 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 impl Error {
     /// An operating-system error at `path`.
     pub fn io(path: impl AsRef<Path>, source: std::io::Error) -> Self {
-        Error::Io {
-            path: path.as_ref().to_owned(),
-            source,
-        }
+        Error::Io { path: path.as_ref().to_owned(), source }
     }
 
     /// A file whose content cannot be used.
     pub fn file(path: impl AsRef<Path>, message: impl Into<String>) -> Self {
-        Error::File {
-            path: path.as_ref().to_owned(),
-            message: message.into(),
-        }
+        Error::File { path: path.as_ref().to_owned(), message: message.into() }
     }
 
     /// A flag or configuration field that cannot be used.
     pub fn setting(name: impl Into<String>, message: impl Into<String>) -> Self {
-        Error::Setting {
-            name: name.into(),
-            message: message.into(),
-        }
+        Error::Setting { name: name.into(), message: message.into() }
     }
 }

@@ -19,17 +19,10 @@ pub fn write_atomically(
     let Some(name) = path.file_name() else {
         return Err(Error::file(path, "expected the name of a file to write"));
     };
-    let folder = path
-        .parent()
-        .filter(|p| !p.as_os_str().is_empty())
-        .unwrap_or(Path::new("."));
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
     let number = COUNTER.fetch_add(1, Ordering::Relaxed);
-    let aside = folder.join(format!(
-        ".{}.{}-{number}.tmp",
-        name.to_string_lossy(),
-        std::process::id()
-    ));
+    let aside = folder.join(format!(".{}.{}-{number}.tmp", name.to_string_lossy(), std::process::id()));
     let result = write_whole(&aside, write).and_then(|()| fs::rename(&aside, path));
     if result.is_err() {
         // The first error is the one to report; a temporary file that cannot be removed adds nothing to it.
@@ -38,10 +31,7 @@ pub fn write_atomically(
     result.map_err(|e| Error::io(path, e))
 }
 
-fn write_whole(
-    path: &Path,
-    write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
-) -> io::Result<()> {
+fn write_whole(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>) -> io::Result<()> {
     let mut writer = BufWriter::new(File::create(path)?);
     write(&mut writer)?;
     writer.flush()?;
@@ -77,11 +67,7 @@ mod tests {
             Err(io::Error::other("the disk is full"))
         })
         .unwrap_err();
-        assert!(
-            error.to_string().contains("file.txt")
-                && error.to_string().contains("the disk is full"),
-            "{error}"
-        );
+        assert!(error.to_string().contains("file.txt") && error.to_string().contains("the disk is full"), "{error}");
         assert_eq!(fs::read(&path).unwrap(), b"old");
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
     }

@@ -36,10 +36,7 @@ pub fn flip_intrinsics(camera: Intrinsics, width: usize) -> Intrinsics {
         return camera;
     }
     let width = width as f64;
-    Intrinsics {
-        cx: (width - 1.0) / width - camera.cx,
-        ..camera
-    }
+    Intrinsics { cx: (width - 1.0) / width - camera.cx, ..camera }
 }
 
 /// One step of a colour jitter.
@@ -147,14 +144,15 @@ fn blend_with(image: &mut RgbImage, factor: f32, other: u8) {
     }
 }
 
-/// Hue, saturation and value, each in 8 bits, truncated; a grey has hue and saturation 0.
+/// Hue, saturation and value, each in 8 bits, truncated; a grey has hue and saturation 0. Quotients are rounded to
+/// f32 and sums are not, as in Pillow: the truncation turns a last bit into a whole level.
 fn rgb_to_hsv([r, g, b]: [u8; 3]) -> [u8; 3] {
     let (high, low) = (r.max(g).max(b), r.min(g).min(b));
     if high == low {
         return [0, 0, high];
     }
     let range = f32::from(high - low);
-    let from_top = |c: u8| f32::from(high - c) / range;
+    let from_top = |c: u8| f64::from(f32::from(high - c) / range);
     let sector = if r == high {
         from_top(b) - from_top(g)
     } else if g == high {
@@ -163,14 +161,10 @@ fn rgb_to_hsv([r, g, b]: [u8; 3]) -> [u8; 3] {
         4.0 + from_top(g) - from_top(r)
     };
     // In [-1, 5]: a sixth of it, modulo 1.
-    let turned = f64::from(sector) / 6.0 + 1.0;
+    let turned = f64::from(sector as f32) / 6.0 + 1.0;
     let hue = (if turned >= 1.0 { turned - 1.0 } else { turned }) as f32;
     let saturation = range / f32::from(high);
-    [
-        (f64::from(hue) * 255.0) as u8,
-        (f64::from(saturation) * 255.0) as u8,
-        high,
-    ]
+    [(f64::from(hue) * 255.0) as u8, (f64::from(saturation) * 255.0) as u8, high]
 }
 
 /// The inverse, rounded.
@@ -178,14 +172,14 @@ fn hsv_to_rgb([h, s, v]: [u8; 3]) -> [u8; 3] {
     if s == 0 {
         return [v, v, v];
     }
-    let sectors = f32::from(h) * 6.0 / 255.0;
+    let sectors = f64::from(h) * 6.0 / 255.0;
     let sector = sectors as u8;
-    let within = sectors - f32::from(sector);
-    let (s, value) = (f32::from(s) / 255.0, f32::from(v));
-    let rounded = |x: f32| (x + 0.5) as u8;
-    let p = rounded(value * (1.0 - s));
-    let q = rounded(value * (1.0 - s * within));
-    let t = rounded(value * (1.0 - s * (1.0 - within)));
+    let within = (sectors - f64::from(sector)) as f32;
+    let (saturation, value) = (f32::from(s) / 255.0, f64::from(v));
+    let rounded = |x: f64| (x + 0.5) as u8;
+    let p = rounded(value * (1.0 - f64::from(saturation)));
+    let q = rounded(value * (1.0 - f64::from(saturation * within)));
+    let t = rounded(value * (1.0 - f64::from(saturation) * (1.0 - f64::from(within))));
     match sector % 6 {
         0 => [v, t, p],
         1 => [q, v, p],
@@ -253,10 +247,7 @@ mod tests {
         }
         assert!((1850..2150).contains(&drawn), "{drawn}");
         assert!((420..580).contains(&hue_first), "{hue_first}");
-        assert!(
-            sums.iter().all(|s| s.abs() / f64::from(drawn) < 0.06),
-            "{sums:?}"
-        );
+        assert!(sums.iter().all(|s| s.abs() / f64::from(drawn) < 0.06), "{sums:?}");
     }
 
     #[test]
@@ -265,21 +256,10 @@ mod tests {
         let source = rgb(&SafeTensors::deserialize(&bytes).unwrap(), "source");
         let (bright, grey) = (Change::Brightness(1.2), Change::Contrast(0.8));
         let (hue, colour) = (Change::Hue(0.1), Change::Saturation(1.2));
-        let one = Jitter {
-            changes: [bright, grey, colour, hue],
-        }
-        .apply(&source);
-        let other = Jitter {
-            changes: [hue, colour, grey, bright],
-        }
-        .apply(&source);
+        let one = Jitter { changes: [bright, grey, colour, hue] }.apply(&source);
+        let other = Jitter { changes: [hue, colour, grey, bright] }.apply(&source);
         assert!(difference(&one, &other).0 > 0.5);
-        let neutral = [
-            Change::Brightness(1.0),
-            Change::Contrast(1.0),
-            Change::Saturation(1.0),
-            Change::Hue(0.0),
-        ];
+        let neutral = [Change::Brightness(1.0), Change::Contrast(1.0), Change::Saturation(1.0), Change::Hue(0.0)];
         // Only the round trip through 8-bit HSV remains.
         assert!(difference(&Jitter { changes: neutral }.apply(&source), &source).0 < 1.5);
     }
@@ -304,12 +284,7 @@ mod tests {
         let reds: Vec<u8> = flip(&ramp).pixels().map(|p| p[0]).collect();
         assert_eq!(reds, [3, 2, 1, 0]);
         assert_eq!(flip_intrinsics(Intrinsics::KITTI, 320), Intrinsics::KITTI);
-        let camera = Intrinsics {
-            fx: 0.5,
-            fy: 1.0,
-            cx: 0.49,
-            cy: 0.4,
-        };
+        let camera = Intrinsics { fx: 0.5, fy: 1.0, cx: 0.49, cy: 0.4 };
         let flipped = flip_intrinsics(camera, 100);
         assert!((flipped.cx * 100.0 - (99.0 - 49.0)).abs() < 1e-9);
         assert!((flip_intrinsics(flipped, 100).cx - camera.cx).abs() < 1e-12);
@@ -318,17 +293,10 @@ mod tests {
     #[test]
     fn a_frame_takes_little_time() {
         let image = RgbImage::from_fn(320, 96, |x, y| {
-            image::Rgb([
-                (x * 7 + y * 3) as u8,
-                (x * 5) as u8 ^ y as u8,
-                (y * 11 + x) as u8,
-            ])
+            image::Rgb([(x * 7 + y * 3) as u8, (x * 5) as u8 ^ y as u8, (y * 11 + x) as u8])
         });
         let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let jitter = std::iter::from_fn(|| Some(Jitter::draw(&mut rng)))
-            .flatten()
-            .next()
-            .unwrap();
+        let jitter = std::iter::from_fn(|| Some(Jitter::draw(&mut rng))).flatten().next().unwrap();
         let best = (0..10)
             .map(|_| {
                 let start = std::time::Instant::now();

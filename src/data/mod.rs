@@ -28,12 +28,7 @@ pub struct Intrinsics {
 
 impl Intrinsics {
     /// The published constants for KITTI: fx 0.58 W, fy 1.92 H, the centre in the middle.
-    pub const KITTI: Intrinsics = Intrinsics {
-        fx: 0.58,
-        fy: 1.92,
-        cx: 0.5,
-        cy: 0.5,
-    };
+    pub const KITTI: Intrinsics = Intrinsics { fx: 0.58, fy: 1.92, cx: 0.5, cy: 0.5 };
 }
 
 /// A map of metric depth (camera z, metres), row-major, 0 where nothing is known.

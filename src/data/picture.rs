@@ -21,16 +21,11 @@ const HEAD: u64 = 64 << 10;
 pub fn check_picture(path: &Path) -> Result<(u32, u32)> {
     let file = File::open(path).map_err(|e| Error::io(path, e))?;
     let mut head = Vec::new();
-    (&file)
-        .take(HEAD)
-        .read_to_end(&mut head)
-        .map_err(|e| Error::io(path, e))?;
+    (&file).take(HEAD).read_to_end(&mut head).map_err(|e| Error::io(path, e))?;
     let dimensions = match dimensions(&head) {
         // A header behind a long preface (a colour profile, a preview): read on.
         Err(_) if head.len() as u64 == HEAD => {
-            (&file)
-                .read_to_end(&mut head)
-                .map_err(|e| Error::io(path, e))?;
+            (&file).read_to_end(&mut head).map_err(|e| Error::io(path, e))?;
             dimensions(&head)
         }
         result => result,
@@ -39,9 +34,7 @@ pub fn check_picture(path: &Path) -> Result<(u32, u32)> {
 }
 
 fn dimensions(bytes: &[u8]) -> Result<(u32, u32), ImageError> {
-    ImageReader::new(Cursor::new(bytes))
-        .with_guessed_format()?
-        .into_dimensions()
+    ImageReader::new(Cursor::new(bytes)).with_guessed_format()?.into_dimensions()
 }
 
 fn check_size(path: &Path, (width, height): (u32, u32)) -> Result<(u32, u32)> {
@@ -49,19 +42,14 @@ fn check_size(path: &Path, (width, height): (u32, u32)) -> Result<(u32, u32)> {
         return Err(Error::file(path, "the picture is empty"));
     }
     if u64::from(width) * u64::from(height) > MAX_PIXELS {
-        let message = format!(
-            "{width}x{height} pixels: pictures above 100 megapixels are refused; make it smaller"
-        );
+        let message = format!("{width}x{height} pixels: pictures above 100 megapixels are refused; make it smaller");
         return Err(Error::file(path, message));
     }
     Ok((width, height))
 }
 
 fn undecodable(path: &Path, error: &ImageError) -> Error {
-    Error::file(
-        path,
-        format!("expected a PNG or JPEG picture, could not decode it ({error}); restore the file"),
-    )
+    Error::file(path, format!("expected a PNG or JPEG picture, could not decode it ({error}); restore the file"))
 }
 
 /// Decodes a PNG or JPEG, whatever its name ends in, with its own channels and bits.
@@ -69,9 +57,7 @@ pub fn decode(path: &Path) -> Result<DynamicImage> {
     let bytes = fs::read(path).map_err(|e| Error::io(path, e))?;
     let size = dimensions(&bytes).map_err(|e| undecodable(path, &e))?;
     check_size(path, size)?;
-    let reader = ImageReader::new(Cursor::new(bytes))
-        .with_guessed_format()
-        .map_err(|e| Error::io(path, e))?;
+    let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format().map_err(|e| Error::io(path, e))?;
     reader.decode().map_err(|e| undecodable(path, &e))
 }
 
@@ -94,11 +80,7 @@ mod tests {
         for &byte in &chunk {
             crc ^= u32::from(byte);
             for _ in 0..8 {
-                crc = if crc & 1 == 1 {
-                    crc >> 1 ^ 0xEDB8_8320
-                } else {
-                    crc >> 1
-                };
+                crc = if crc & 1 == 1 { crc >> 1 ^ 0xEDB8_8320 } else { crc >> 1 };
             }
         }
         let mut bytes = b"\x89PNG\r\n\x1a\n\0\0\0\x0d".to_vec();
@@ -116,10 +98,7 @@ mod tests {
         fs::write(&path, png_header(1242, 375)).unwrap();
         assert_eq!(check_picture(&path).unwrap(), (1242, 375));
         let error = read_picture(&path).unwrap_err().to_string();
-        assert!(
-            error.contains("a.png") && error.contains("could not decode"),
-            "{error}"
-        );
+        assert!(error.contains("a.png") && error.contains("could not decode"), "{error}");
     }
 
     #[test]
@@ -127,15 +106,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("huge.png");
         fs::write(&path, png_header(20_000, 5_001)).unwrap();
-        for error in [
-            check_picture(&path).unwrap_err(),
-            read_picture(&path).unwrap_err(),
-        ] {
+        for error in [check_picture(&path).unwrap_err(), read_picture(&path).unwrap_err()] {
             let error = error.to_string();
-            assert!(
-                error.contains("huge.png") && error.contains("20000x5001"),
-                "{error}"
-            );
+            assert!(error.contains("huge.png") && error.contains("20000x5001"), "{error}");
         }
     }
 
@@ -143,48 +116,25 @@ mod tests {
     fn what_is_no_picture_is_named() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("b.png");
-        for bytes in [
-            b"".as_slice(),
-            b"not a picture",
-            b"\x89PNG\r\n\x1a\n",
-            b"\xff\xd8\xff\xe0",
-        ] {
+        for bytes in [b"".as_slice(), b"not a picture", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff\xe0"] {
             fs::write(&path, bytes).unwrap();
-            for error in [
-                check_picture(&path).unwrap_err(),
-                read_picture(&path).unwrap_err(),
-            ] {
+            for error in [check_picture(&path).unwrap_err(), read_picture(&path).unwrap_err()] {
                 assert!(error.to_string().contains("b.png"), "{error}");
             }
         }
-        assert!(
-            check_picture(&folder.path().join("c.png"))
-                .unwrap_err()
-                .to_string()
-                .contains("c.png")
-        );
+        assert!(check_picture(&folder.path().join("c.png")).unwrap_err().to_string().contains("c.png"));
     }
 
     #[test]
     fn jpeg_and_grey_become_rgb() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.jpg");
-        RgbImage::from_pixel(16, 8, image::Rgb([90, 120, 30]))
-            .save(&path)
-            .unwrap();
+        RgbImage::from_pixel(16, 8, image::Rgb([90, 120, 30])).save(&path).unwrap();
         assert_eq!(check_picture(&path).unwrap(), (16, 8));
         let pixel = read_picture(&path).unwrap().get_pixel(8, 4).0;
-        assert!(
-            pixel
-                .iter()
-                .zip([90, 120, 30])
-                .all(|(a, b)| a.abs_diff(b) < 6),
-            "{pixel:?}"
-        );
+        assert!(pixel.iter().zip([90, 120, 30]).all(|(a, b)| a.abs_diff(b) < 6), "{pixel:?}");
         let path = folder.path().join("g.png");
-        image::GrayImage::from_pixel(4, 4, image::Luma([77]))
-            .save(&path)
-            .unwrap();
+        image::GrayImage::from_pixel(4, 4, image::Luma([77])).save(&path).unwrap();
         assert_eq!(read_picture(&path).unwrap().get_pixel(1, 1).0, [77, 77, 77]);
     }
 }

@@ -41,10 +41,7 @@ mod tests {
         let scales = pyramid(&source, 320, 96, 4);
         let sizes: Vec<_> = scales.iter().map(RgbImage::dimensions).collect();
         assert_eq!(sizes, [(320, 96), (160, 48), (80, 24), (40, 12)]);
-        assert_eq!(
-            difference(&scales[0], &rgb(&file, "lanczos/320x96")),
-            (0.0, 0)
-        );
+        assert_eq!(difference(&scales[0], &rgb(&file, "lanczos/320x96")), (0.0, 0));
         assert_eq!(scales[2], lanczos(&scales[1], 80, 24));
         // A cascade differs from the direct resize, but not by much.
         let (mean, _) = difference(&scales[2], &rgb(&file, "lanczos/80x24"));

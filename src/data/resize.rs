@@ -15,14 +15,8 @@ const FRACTION_BITS: u32 = 22;
 /// # Panics
 /// If a side of the picture or of the result is 0.
 pub fn lanczos(image: &RgbImage, width: u32, height: u32) -> RgbImage {
-    assert!(
-        width > 0 && height > 0,
-        "lanczos: a size above 0 expected, found {width}x{height}"
-    );
-    assert!(
-        image.width() > 0 && image.height() > 0,
-        "lanczos: the picture is empty"
-    );
+    assert!(width > 0 && height > 0, "lanczos: a size above 0 expected, found {width}x{height}");
+    assert!(image.width() > 0 && image.height() > 0, "lanczos: the picture is empty");
     if image.dimensions() == (width, height) {
         return image.clone();
     }
@@ -48,15 +42,10 @@ fn windows(input: usize, output: usize) -> Vec<Window> {
         let centre = (i as f64 + 0.5) * scale;
         let first = (centre - support + 0.5).max(0.0) as usize;
         let end = ((centre + support + 0.5) as usize).min(input);
-        let weights: Vec<f64> = (first..end)
-            .map(|j| kernel((j as f64 - centre + 0.5) / stretch))
-            .collect();
+        let weights: Vec<f64> = (first..end).map(|j| kernel((j as f64 - centre + 0.5) / stretch)).collect();
         let sum: f64 = weights.iter().sum();
         let fixed = |w: &f64| (w / sum * f64::from(1 << FRACTION_BITS)).round() as i32;
-        Window {
-            first,
-            weights: weights.iter().map(fixed).collect(),
-        }
+        Window { first, weights: weights.iter().map(fixed).collect() }
     };
     (0..output).map(window).collect()
 }
@@ -67,11 +56,7 @@ fn kernel(x: f64) -> f64 {
         let x = x * std::f64::consts::PI;
         if x == 0.0 { 1.0 } else { x.sin() / x }
     };
-    if x.abs() < LOBES {
-        sinc(x) * sinc(x / LOBES)
-    } else {
-        0.0
-    }
+    if x.abs() < LOBES { sinc(x) * sinc(x / LOBES) } else { 0.0 }
 }
 
 /// Fixed point to 8 bits, rounded; the lobes below zero make sums outside [0, 255].
@@ -85,10 +70,7 @@ fn resize_columns(bytes: &[u8], in_width: usize, height: usize, width: usize) ->
     }
     let windows = windows(in_width, width);
     let mut out = vec![0; width * height * 3];
-    for (row, out_row) in bytes
-        .chunks_exact(in_width * 3)
-        .zip(out.chunks_exact_mut(width * 3))
-    {
+    for (row, out_row) in bytes.chunks_exact(in_width * 3).zip(out.chunks_exact_mut(width * 3)) {
         for (window, pixel) in windows.iter().zip(out_row.chunks_exact_mut(3)) {
             let mut sums = [0i32; 3];
             for (rgb, &w) in row[window.first * 3..].chunks_exact(3).zip(&window.weights) {
@@ -111,15 +93,9 @@ fn resize_rows(bytes: &[u8], width: usize, in_height: usize, height: usize) -> V
     let stride = width * 3;
     let mut sums = vec![0i32; stride];
     let mut out = vec![0; stride * height];
-    for (window, out_row) in windows(in_height, height)
-        .iter()
-        .zip(out.chunks_exact_mut(stride))
-    {
+    for (window, out_row) in windows(in_height, height).iter().zip(out.chunks_exact_mut(stride)) {
         sums.fill(0);
-        for (row, &w) in bytes[window.first * stride..]
-            .chunks_exact(stride)
-            .zip(&window.weights)
-        {
+        for (row, &w) in bytes[window.first * stride..].chunks_exact(stride).zip(&window.weights) {
             for (sum, &c) in sums.iter_mut().zip(row) {
                 *sum += i32::from(c) * w;
             }
@@ -145,11 +121,7 @@ mod tests {
         let source = rgb(&file, "source");
         for (width, height) in [(160, 48), (80, 24), (320, 96)] {
             let expected = rgb(&file, &format!("lanczos/{width}x{height}"));
-            assert_eq!(
-                difference(&lanczos(&source, width, height), &expected),
-                (0.0, 0),
-                "{width}x{height}"
-            );
+            assert_eq!(difference(&lanczos(&source, width, height), &expected), (0.0, 0), "{width}x{height}");
         }
     }
 
@@ -166,10 +138,7 @@ mod tests {
         let flat = RgbImage::from_pixel(13, 7, image::Rgb([0, 255, 131]));
         for (width, height) in [(5, 3), (40, 2), (13, 20), (1, 1)] {
             let out = lanczos(&flat, width, height);
-            assert!(
-                out.pixels().all(|p| p.0 == [0, 255, 131]),
-                "{width}x{height}"
-            );
+            assert!(out.pixels().all(|p| p.0 == [0, 255, 131]), "{width}x{height}");
         }
         let ramp = RgbImage::from_fn(13, 7, |x, y| image::Rgb([x as u8 * 9, y as u8 * 11, 5]));
         assert_eq!(lanczos(&ramp, 13, 7), ramp);

@@ -35,15 +35,12 @@ pub enum Protocol {
 impl Protocol {
     /// Rows and columns that count in an image of `height x width`, end exclusive.
     fn window(self, height: usize, width: usize) -> [std::ops::Range<usize>; 2] {
-        let part = |size: usize, from: f64, to: f64| {
-            (from * size as f64) as usize..(to * size as f64) as usize
-        };
+        let part = |size: usize, from: f64, to: f64| (from * size as f64) as usize..(to * size as f64) as usize;
         match self {
             Protocol::Dense | Protocol::Improved => [0..height, 0..width],
-            Protocol::Eigen | Protocol::EigenCameraZ => [
-                part(height, 0.40810811, 0.99189189),
-                part(width, 0.03594771, 0.96405229),
-            ],
+            Protocol::Eigen | Protocol::EigenCameraZ => {
+                [part(height, 0.40810811, 0.99189189), part(width, 0.03594771, 0.96405229)]
+            }
         }
     }
 
@@ -65,8 +62,7 @@ impl FromStr for Protocol {
             "eigen-camera-z" => Ok(Protocol::EigenCameraZ),
             "improved" => Ok(Protocol::Improved),
             _ => {
-                let message =
-                    format!("expected dense, eigen, eigen-camera-z or improved, found {name:?}");
+                let message = format!("expected dense, eigen, eigen-camera-z or improved, found {name:?}");
                 Err(Error::setting("protocol", message))
             }
         }
@@ -93,8 +89,7 @@ impl FromStr for Scale {
             ("stereo", _) => Ok(Scale::Stereo),
             (_, Ok(factor)) if factor > 0.0 && factor.is_finite() => Ok(Scale::Factor(factor)),
             _ => {
-                let message =
-                    format!("expected median, stereo or a number above 0, found {name:?}");
+                let message = format!("expected median, stereo or a number above 0, found {name:?}");
                 Err(Error::setting("scale", message))
             }
         }
@@ -139,46 +134,24 @@ impl Metrics {
             return None;
         }
         let mean = Metrics::from_array(sum.to_array().map(|s| s / pairs.len() as f64));
-        Some(Metrics {
-            rmse: mean.rmse.sqrt(),
-            rmse_log: mean.rmse_log.sqrt(),
-            ..mean
-        })
+        Some(Metrics { rmse: mean.rmse.sqrt(), rmse_log: mean.rmse_log.sqrt(), ..mean })
     }
 
     /// abs_rel, sq_rel, rmse, rmse_log, a1, a2, a3.
     pub fn to_array(self) -> [f64; 7] {
-        [
-            self.abs_rel,
-            self.sq_rel,
-            self.rmse,
-            self.rmse_log,
-            self.a1,
-            self.a2,
-            self.a3,
-        ]
+        [self.abs_rel, self.sq_rel, self.rmse, self.rmse_log, self.a1, self.a2, self.a3]
     }
 
     /// The reverse of [`Metrics::to_array`].
     pub fn from_array([abs_rel, sq_rel, rmse, rmse_log, a1, a2, a3]: [f64; 7]) -> Metrics {
-        Metrics {
-            abs_rel,
-            sq_rel,
-            rmse,
-            rmse_log,
-            a1,
-            a2,
-            a3,
-        }
+        Metrics { abs_rel, sq_rel, rmse, rmse_log, a1, a2, a3 }
     }
 
     /// The mean of each metric over images; `None` without one.
     pub fn mean(images: impl IntoIterator<Item = Metrics>) -> Option<Metrics> {
         let (mut sum, mut count) = ([0.0; 7], 0);
         for image in images {
-            sum.iter_mut()
-                .zip(image.to_array())
-                .for_each(|(s, m)| *s += m);
+            sum.iter_mut().zip(image.to_array()).for_each(|(s, m)| *s += m);
             count += 1;
         }
         (count > 0).then(|| Metrics::from_array(sum.map(|s| s / f64::from(count))))
@@ -211,14 +184,9 @@ pub fn evaluate_image(
     let (height, width) = (ground_truth.height, ground_truth.width);
     check_map("prediction", inverse_depth.len(), size)?;
     check_map("ground truth", ground_truth.metres.len(), (height, width))?;
-    if let Some(i) = inverse_depth
-        .iter()
-        .position(|d| !(*d > 0.0 && d.is_finite()))
-    {
+    if let Some(i) = inverse_depth.iter().position(|d| !(*d > 0.0 && d.is_finite())) {
         let (row, column, value) = (i / size.1, i % size.1, inverse_depth[i]);
-        let message = format!(
-            "the prediction at row {row}, column {column} is {value}: not a positive inverse depth"
-        );
+        let message = format!("the prediction at row {row}, column {column} is {value}: not a positive inverse depth");
         return Err(Error::Failed(message));
     }
     let resized = resize_bilinear(inverse_depth, size, (height, width));
@@ -246,11 +214,7 @@ pub fn evaluate_image(
     for pair in &mut pairs {
         pair.1 = (pair.1 * factor).clamp(MIN_DEPTH, MAX_DEPTH);
     }
-    Ok(ImageMetrics {
-        pixels: pairs.len(),
-        ratio,
-        metrics: Metrics::of(&pairs),
-    })
+    Ok(ImageMetrics { pixels: pairs.len(), ratio, metrics: Metrics::of(&pairs) })
 }
 
 fn check_map(what: &str, values: usize, (height, width): (usize, usize)) -> Result<()> {
@@ -269,11 +233,7 @@ pub fn median(mut values: Vec<f64>) -> Option<f64> {
     }
     let (below, &mut upper, _) = values.select_nth_unstable_by(middle, f64::total_cmp);
     // The lower of the middle two is the largest of what lies below.
-    let lower = below
-        .iter()
-        .copied()
-        .max_by(f64::total_cmp)
-        .filter(|_| middle * 2 == values.len());
+    let lower = below.iter().copied().max_by(f64::total_cmp).filter(|_| middle * 2 == values.len());
     Some(lower.map_or(upper, |lower| (lower + upper) / 2.0))
 }
 
@@ -283,16 +243,9 @@ pub fn median(mut values: Vec<f64>) -> Option<f64> {
 /// # Panics
 /// If `map` does not hold `from.0 * from.1` values or a size is empty.
 pub fn resize_bilinear(map: &[f32], from: (usize, usize), to: (usize, usize)) -> Vec<f64> {
-    assert_eq!(
-        map.len(),
-        from.0 * from.1,
-        "resize_bilinear: a map of {from:?} expected"
-    );
+    assert_eq!(map.len(), from.0 * from.1, "resize_bilinear: a map of {from:?} expected");
     let taps = |input: usize, output: usize| -> Vec<(usize, usize, f64)> {
-        assert!(
-            input > 0 && output > 0,
-            "resize_bilinear: {from:?} to {to:?}"
-        );
+        assert!(input > 0 && output > 0, "resize_bilinear: {from:?} to {to:?}");
         let scale = input as f64 / output as f64;
         let tap = |i: usize| {
             let x = ((i as f64 + 0.5) * scale - 0.5).max(0.0);
@@ -320,15 +273,8 @@ pub fn resize_bilinear(map: &[f32], from: (usize, usize), to: (usize, usize)) ->
 /// # Panics
 /// If the maps differ in length or are not rows of `width`.
 pub fn flip_post_process(left: &[f32], right: &[f32], width: usize) -> Vec<f32> {
-    assert_eq!(
-        left.len(),
-        right.len(),
-        "flip_post_process: two maps of one size expected"
-    );
-    assert!(
-        width > 0 && left.len().is_multiple_of(width),
-        "flip_post_process: rows of {width} expected"
-    );
+    assert_eq!(left.len(), right.len(), "flip_post_process: two maps of one size expected");
+    assert!(width > 0 && left.len().is_multiple_of(width), "flip_post_process: rows of {width} expected");
     // 1 at the left border, 0 from a tenth of the width on.
     let ramp = |i: usize| {
         let x = i as f64 / (width - 1).max(1) as f64;
@@ -349,13 +295,8 @@ pub fn flip_post_process(left: &[f32], right: &[f32], width: usize) -> Vec<f32> 
 /// # Panics
 /// If the map is not rows of `width`.
 pub fn mirror(map: &[f32], width: usize) -> Vec<f32> {
-    assert!(
-        width > 0 && map.len().is_multiple_of(width),
-        "mirror: rows of {width} expected"
-    );
-    map.chunks_exact(width)
-        .flat_map(|row| row.iter().rev().copied())
-        .collect()
+    assert!(width > 0 && map.len().is_multiple_of(width), "mirror: rows of {width} expected");
+    map.chunks_exact(width).flat_map(|row| row.iter().rev().copied()).collect()
 }
 
 /// One image of a [`Report`].
@@ -397,45 +338,25 @@ impl Report {
     /// If no image has a pixel that counts.
     pub fn new(images: impl IntoIterator<Item = (String, ImageMetrics)>) -> Result<Report> {
         let (mut per_image, mut without_pixels) = (Vec::new(), Vec::new());
-        for (
-            name,
-            ImageMetrics {
-                pixels,
-                ratio,
-                metrics,
-            },
-        ) in images
-        {
+        for (name, ImageMetrics { pixels, ratio, metrics }) in images {
             match metrics {
-                Some(metrics) => per_image.push(PerImage {
-                    name,
-                    pixels,
-                    ratio,
-                    metrics,
-                }),
+                Some(metrics) => per_image.push(PerImage { name, pixels, ratio, metrics }),
                 None => without_pixels.push(name),
             }
         }
         let Some(metrics) = Metrics::mean(per_image.iter().map(|image| image.metrics)) else {
             let message = match without_pixels.len() {
                 0 => "nothing to evaluate: no image has ground-truth depth".to_owned(),
-                n => format!(
-                    "nothing to evaluate: of {n} images none has ground-truth depth that this protocol counts"
-                ),
+                n => {
+                    format!("nothing to evaluate: of {n} images none has ground-truth depth that this protocol counts")
+                }
             };
             return Err(Error::Failed(message));
         };
         let ratios: Vec<f64> = per_image.iter().filter_map(|image| image.ratio).collect();
         let ratio_median = median(ratios.clone());
         let ratio_std = ratio_median.map(|m| standard_deviation(ratios.iter().map(|r| r / m)));
-        Ok(Report {
-            images: per_image.len(),
-            metrics,
-            ratio_median,
-            ratio_std,
-            per_image,
-            without_pixels,
-        })
+        Ok(Report { images: per_image.len(), metrics, ratio_median, ratio_std, per_image, without_pixels })
     }
 }
 
@@ -474,11 +395,7 @@ impl MeanMap {
             check_map("ground truth", map.metres.len(), own)?;
             let known = |metres: f32| metres > 0.0 && metres.is_finite();
             let inverse = |&m: &f32| {
-                if known(m) {
-                    1.0 / m.max(MIN_DEPTH as f32)
-                } else {
-                    FARTHEST as f32
-                }
+                if known(m) { 1.0 / m.max(MIN_DEPTH as f32) } else { FARTHEST as f32 }
             };
             let inverse: Vec<f32> = map.metres.iter().map(inverse).collect();
             if count == 0 {
@@ -486,21 +403,14 @@ impl MeanMap {
                 sum = vec![0.0; inverse.len()];
             }
             let at_size = resize_bilinear(&inverse, own, size);
-            sum.iter_mut()
-                .zip(at_size)
-                .for_each(|(s, v): (&mut f64, f64)| *s += v);
+            sum.iter_mut().zip(at_size).for_each(|(s, v): (&mut f64, f64)| *s += v);
             count += 1;
         }
         if count == 0 {
-            return Err(Error::Failed(
-                "no mean depth map: no frame has ground-truth depth".to_owned(),
-            ));
+            return Err(Error::Failed("no mean depth map: no frame has ground-truth depth".to_owned()));
         }
         let mean = |s: &f64| (s / f64::from(count)).clamp(FARTHEST, NEAREST) as f32;
-        Ok(MeanMap {
-            size,
-            inverse_depth: sum.iter().map(mean).collect(),
-        })
+        Ok(MeanMap { size, inverse_depth: sum.iter().map(mean).collect() })
     }
 
     /// [`MeanMap::of`] the target frames of a data set (the one that a network is trained on).

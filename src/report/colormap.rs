@@ -63,16 +63,8 @@ pub fn magma(x: f32) -> Rgb<u8> {
 /// # Panics
 /// If `disparity` does not hold `width * height` values.
 pub fn disparity_to_image(disparity: &[f32], width: usize, height: usize) -> RgbImage {
-    assert_eq!(
-        disparity.len(),
-        width * height,
-        "disparity_to_image: {width}x{height} values expected"
-    );
-    let mut finite: Vec<f32> = disparity
-        .iter()
-        .copied()
-        .filter(|d| d.is_finite())
-        .collect();
+    assert_eq!(disparity.len(), width * height, "disparity_to_image: {width}x{height} values expected");
+    let mut finite: Vec<f32> = disparity.iter().copied().filter(|d| d.is_finite()).collect();
     finite.sort_unstable_by(f32::total_cmp);
     let low = finite.first().copied().unwrap_or(0.0);
     let range = percentile(&finite, 95.0) - low;
@@ -103,9 +95,7 @@ mod tests {
         assert_eq!(MAGMA[0], [0, 0, 3]);
         assert_eq!(MAGMA[128], [182, 54, 121]);
         assert_eq!(MAGMA[255], [251, 252, 191]);
-        let luma = |c: &[u8; 3]| {
-            0.299 * f64::from(c[0]) + 0.587 * f64::from(c[1]) + 0.114 * f64::from(c[2])
-        };
+        let luma = |c: &[u8; 3]| 0.299 * f64::from(c[0]) + 0.587 * f64::from(c[1]) + 0.114 * f64::from(c[2]);
         for pair in MAGMA.windows(2) {
             assert!(luma(&pair[1]) > luma(&pair[0]) - 1.5, "{pair:?}");
         }
@@ -134,10 +124,7 @@ mod tests {
 
     #[test]
     fn constant_and_poisoned_maps_have_a_picture_too() {
-        assert_eq!(
-            disparity_to_image(&[0.3; 6], 3, 2).get_pixel(1, 1).0,
-            MAGMA[0]
-        );
+        assert_eq!(disparity_to_image(&[0.3; 6], 3, 2).get_pixel(1, 1).0, MAGMA[0]);
         let picture = disparity_to_image(&[0.0, f32::NAN, 1.0, f32::INFINITY], 4, 1);
         assert_eq!(picture.get_pixel(1, 0).0, MAGMA[0]);
         assert_eq!(picture.get_pixel(2, 0).0, MAGMA[255]);

@@ -13,11 +13,7 @@ use crate::{Error, Result};
 /// Metres in 16 bits: `round(256 * metres)`; 0 (unknown) for what is not a positive finite number. A known depth
 /// never rounds to 0, and one beyond 255.996 m takes the largest value.
 pub fn encode_depth(metres: f32) -> u16 {
-    if metres > 0.0 && metres.is_finite() {
-        (metres * 256.0).round().clamp(1.0, 65535.0) as u16
-    } else {
-        0
-    }
+    if metres > 0.0 && metres.is_finite() { (metres * 256.0).round().clamp(1.0, 65535.0) as u16 } else { 0 }
 }
 
 /// Writes a depth map as a 16-bit PNG of metres times 256, whole or not at all.
@@ -29,16 +25,9 @@ pub fn write_depth_png(path: impl AsRef<Path>, depth: &DepthMap) -> Result<()> {
     let (width, height) = (depth.width, depth.height);
     if depth.metres.is_empty() || depth.metres.len() != width * height {
         let found = depth.metres.len();
-        return Err(Error::file(
-            path,
-            format!("a depth map of {width}x{height} has {found} depths"),
-        ));
+        return Err(Error::file(path, format!("a depth map of {width}x{height} has {found} depths")));
     }
-    let bytes: Vec<u8> = depth
-        .metres
-        .iter()
-        .flat_map(|&m| encode_depth(m).to_ne_bytes())
-        .collect();
+    let bytes: Vec<u8> = depth.metres.iter().flat_map(|&m| encode_depth(m).to_ne_bytes()).collect();
     write_atomically(path, |writer| {
         PngEncoder::new(writer)
             .write_image(&bytes, width as u32, height as u32, ExtendedColorType::L16)
@@ -68,11 +57,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("depth.png");
         let metres: Vec<f32> = (0..35).map(|i| i as f32 * 2.3).collect();
-        let depth = DepthMap {
-            width: 7,
-            height: 5,
-            metres,
-        };
+        let depth = DepthMap { width: 7, height: 5, metres };
         write_depth_png(&path, &depth).unwrap();
         let read = read_depth_png(&path).unwrap();
         assert_eq!((read.width, read.height), (7, 5));
@@ -84,14 +69,8 @@ mod tests {
 
     #[test]
     fn a_map_of_the_wrong_size_is_refused() {
-        let depth = DepthMap {
-            width: 7,
-            height: 5,
-            metres: vec![1.0; 3],
-        };
-        let error = write_depth_png("/nowhere/depth.png", &depth)
-            .unwrap_err()
-            .to_string();
+        let depth = DepthMap { width: 7, height: 5, metres: vec![1.0; 3] };
+        let error = write_depth_png("/nowhere/depth.png", &depth).unwrap_err().to_string();
         assert!(error.contains("7x5") && error.contains('3'), "{error}");
     }
 }

@@ -10,12 +10,7 @@ use crate::files::write_atomically;
 ///
 /// # Panics
 /// If `values` does not hold `height * width` values.
-pub fn write_npy(
-    path: impl AsRef<Path>,
-    values: &[f32],
-    height: usize,
-    width: usize,
-) -> Result<()> {
+pub fn write_npy(path: impl AsRef<Path>, values: &[f32], height: usize, width: usize) -> Result<()> {
     write_npy_shaped(path, values, &[height, width])
 }
 
@@ -24,11 +19,7 @@ pub fn write_npy(
 /// # Panics
 /// If `values` does not hold the product of `shape` values.
 pub fn write_npy_shaped(path: impl AsRef<Path>, values: &[f32], shape: &[usize]) -> Result<()> {
-    assert_eq!(
-        values.len(),
-        shape.iter().product::<usize>(),
-        "write_npy: values for the shape {shape:?} expected"
-    );
+    assert_eq!(values.len(), shape.iter().product::<usize>(), "write_npy: values for the shape {shape:?} expected");
     write_atomically(path, |writer| {
         writer.write_all(&header(shape))?;
         write_values(writer, values)
@@ -40,14 +31,9 @@ fn header(shape: &[usize]) -> Vec<u8> {
     const FIXED: usize = 10;
     let dimensions = match shape {
         [one] => format!("{one},"),
-        _ => shape
-            .iter()
-            .map(usize::to_string)
-            .collect::<Vec<_>>()
-            .join(", "),
+        _ => shape.iter().map(usize::to_string).collect::<Vec<_>>().join(", "),
     };
-    let mut dictionary =
-        format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({dimensions}), }}");
+    let mut dictionary = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({dimensions}), }}");
     while (FIXED + dictionary.len() + 1) % 64 != 0 {
         dictionary.push(' ');
     }
@@ -59,9 +45,7 @@ fn header(shape: &[usize]) -> Vec<u8> {
 }
 
 fn write_values(writer: &mut impl Write, values: &[f32]) -> io::Result<()> {
-    values
-        .iter()
-        .try_for_each(|value| writer.write_all(&value.to_le_bytes()))
+    values.iter().try_for_each(|value| writer.write_all(&value.to_le_bytes()))
 }
 
 #[cfg(test)]
@@ -78,15 +62,10 @@ mod tests {
         let length = usize::from(u16::from_le_bytes([bytes[8], bytes[9]]));
         assert_eq!((10 + length) % 64, 0);
         let text = std::str::from_utf8(&bytes[10..10 + length]).unwrap();
-        assert_eq!(
-            text.trim_end(),
-            "{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3), }"
-        );
+        assert_eq!(text.trim_end(), "{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3), }");
         assert!(text.ends_with('\n'));
-        let values: Vec<f32> = bytes[10 + length..]
-            .chunks_exact(4)
-            .map(|b| f32::from_le_bytes(b.try_into().unwrap()))
-            .collect();
+        let values: Vec<f32> =
+            bytes[10 + length..].chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
         assert_eq!(values, [1.0, 2.5, -3.0, 0.0, f32::INFINITY, 6.0]);
     }
 

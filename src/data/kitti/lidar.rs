@@ -27,9 +27,7 @@ pub fn check_scan(path: &Path) -> Result<()> {
 
 fn check_length(path: &Path, length: u64) -> Result<()> {
     if length == 0 || !length.is_multiple_of(POINT as u64) {
-        let message = format!(
-            "expected a LiDAR scan of {POINT} bytes a point, found {length} bytes: the file is cut"
-        );
+        let message = format!("expected a LiDAR scan of {POINT} bytes a point, found {length} bytes: the file is cut");
         return Err(Error::file(path, message));
     }
     Ok(())
@@ -42,9 +40,7 @@ pub fn read_scan(path: &Path) -> Result<Vec<[f32; 3]>> {
     let points = bytes.as_chunks::<POINT>().0.iter();
     Ok(points
         .map(|point| {
-            let [x, y, z, _] = point.as_chunks::<4>().0 else {
-                unreachable!("sixteen bytes are four floats")
-            };
+            let [x, y, z, _] = point.as_chunks::<4>().0 else { unreachable!("sixteen bytes are four floats") };
             [x, y, z].map(|b| f32::from_le_bytes(*b))
         })
         .collect())
@@ -66,10 +62,7 @@ pub fn project_scan(
         let rows = lidar_to_image.as_chunks::<4>().0;
         let row = |i: usize| rows[i][0] * x + rows[i][1] * y + rows[i][2] * z + rows[i][3];
         let camera_z = row(2);
-        let (column, line) = (
-            (row(0) / camera_z).round_ties_even() - 1.0,
-            (row(1) / camera_z).round_ties_even() - 1.0,
-        );
+        let (column, line) = ((row(0) / camera_z).round_ties_even() - 1.0, (row(1) / camera_z).round_ties_even() - 1.0);
         // Also false for what is not a number.
         if (0.0..width as f64).contains(&column) && (0.0..height as f64).contains(&line) {
             let depth = match axis {
@@ -80,21 +73,8 @@ pub fn project_scan(
             *pixel = pixel.min(depth);
         }
     }
-    let metres = nearest
-        .iter()
-        .map(|&d| {
-            if d > 0.0 && d.is_finite() {
-                d as f32
-            } else {
-                0.0
-            }
-        })
-        .collect();
-    DepthMap {
-        width,
-        height,
-        metres,
-    }
+    let metres = nearest.iter().map(|&d| if d > 0.0 && d.is_finite() { d as f32 } else { 0.0 }).collect();
+    DepthMap { width, height, metres }
 }
 
 #[cfg(test)]
@@ -102,19 +82,11 @@ mod tests {
     use super::*;
 
     /// Camera axes from the LiDAR's, focal length 10, centre (5, 4).
-    const P: [f64; 12] = [
-        5.0, -10.0, 0.0, 0.0, 4.0, 0.0, -10.0, 0.0, 1.0, 0.0, 0.0, 0.0,
-    ];
+    const P: [f64; 12] = [5.0, -10.0, 0.0, 0.0, 4.0, 0.0, -10.0, 0.0, 1.0, 0.0, 0.0, 0.0];
 
     #[test]
     fn nearest_point_wins_and_pixels_count_from_one() {
-        let points = [
-            [4.0, 0.0, 0.0],
-            [2.0, 0.0, 0.0],
-            [8.0, 0.0, 0.0],
-            [-3.0, 0.0, 0.0],
-            [f32::NAN, 0.0, 0.0],
-        ];
+        let points = [[4.0, 0.0, 0.0], [2.0, 0.0, 0.0], [8.0, 0.0, 0.0], [-3.0, 0.0, 0.0], [f32::NAN, 0.0, 0.0]];
         let depth = project_scan(&points, &P, 10, 8, DepthAxis::CameraZ);
         // (u, v) = (5, 4) is column 4, row 3.
         assert_eq!(depth.metres[3 * 10 + 4], 2.0);
@@ -141,13 +113,7 @@ mod tests {
     fn the_axis_is_the_depth() {
         let mut p = P;
         p[11] = -0.25;
-        let at = |axis| {
-            project_scan(&[[2.0, 0.0, 0.0]], &p, 12, 8, axis)
-                .metres
-                .iter()
-                .copied()
-                .fold(0.0, f32::max)
-        };
+        let at = |axis| project_scan(&[[2.0, 0.0, 0.0]], &p, 12, 8, axis).metres.iter().copied().fold(0.0, f32::max);
         assert_eq!(at(DepthAxis::CameraZ), 1.75);
         assert_eq!(at(DepthAxis::LidarX), 2.0);
     }
@@ -157,22 +123,10 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scan.bin");
         fs::write(&path, [0; 40]).unwrap();
-        for error in [
-            check_scan(&path).unwrap_err(),
-            read_scan(&path).unwrap_err(),
-        ] {
-            assert!(
-                error.to_string().contains("scan.bin") && error.to_string().contains("40 bytes"),
-                "{error}"
-            );
+        for error in [check_scan(&path).unwrap_err(), read_scan(&path).unwrap_err()] {
+            assert!(error.to_string().contains("scan.bin") && error.to_string().contains("40 bytes"), "{error}");
         }
-        fs::write(
-            &path,
-            [1.5f32, -2.0, 0.25, 0.5]
-                .map(f32::to_le_bytes)
-                .as_flattened(),
-        )
-        .unwrap();
+        fs::write(&path, [1.5f32, -2.0, 0.25, 0.5].map(f32::to_le_bytes).as_flattened()).unwrap();
         assert_eq!(read_scan(&path).unwrap(), [[1.5, -2.0, 0.25]]);
     }
 }

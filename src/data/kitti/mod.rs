@@ -94,10 +94,7 @@ struct Frame {
 
 impl Frame {
     fn at(self, offset: i32) -> Option<Frame> {
-        Some(Frame {
-            number: self.number.checked_add_signed(offset)?,
-            ..self
-        })
+        Some(Frame { number: self.number.checked_add_signed(offset)?, ..self })
     }
 }
 
@@ -115,25 +112,16 @@ impl Drive {
     fn picture(&self, number: u32, side: Side) -> Result<PathBuf, PathBuf> {
         let folder = self.path.join(side.folder()).join("data");
         let with = |extension: &str| folder.join(format!("{number:010}.{extension}"));
-        ["png", "jpg"]
-            .into_iter()
-            .map(with)
-            .find(|path| path.is_file())
-            .ok_or_else(|| with("png"))
+        ["png", "jpg"].into_iter().map(with).find(|path| path.is_file()).ok_or_else(|| with("png"))
     }
 
     fn depth_png(&self, frame: Frame) -> PathBuf {
-        let folder = self
-            .path
-            .join("proj_depth/groundtruth")
-            .join(frame.side.folder());
+        let folder = self.path.join("proj_depth/groundtruth").join(frame.side.folder());
         folder.join(format!("{:010}.png", frame.number))
     }
 
     fn scan(&self, frame: Frame) -> PathBuf {
-        self.path
-            .join("velodyne_points/data")
-            .join(format!("{:010}.bin", frame.number))
+        self.path.join("velodyne_points/data").join(format!("{:010}.bin", frame.number))
     }
 
     /// The folder of the day, which holds the calibration.
@@ -167,18 +155,9 @@ impl Kitti {
     /// Everything is checked here: lines that cannot be read or that point nowhere (with file and line number),
     /// missing neighbours, pictures whose header does not decode or that exceed 100 megapixels, missing or malformed
     /// calibration and ground truth where they are asked for.
-    pub fn open(
-        root: &Path,
-        split: Option<&Path>,
-        height: usize,
-        width: usize,
-        options: Options,
-    ) -> Result<Kitti> {
+    pub fn open(root: &Path, split: Option<&Path>, height: usize, width: usize, options: Options) -> Result<Kitti> {
         if !root.is_dir() {
-            return Err(Error::file(
-                root,
-                "expected a folder in the layout of KITTI raw, found none; check the path",
-            ));
+            return Err(Error::file(root, "expected a folder in the layout of KITTI raw, found none; check the path"));
         }
         let mut kitti = Kitti {
             drives: Vec::new(),
@@ -201,36 +180,24 @@ impl Kitti {
         let mut checked = HashSet::new();
         let lines = read_split(split)?;
         if lines.is_empty() {
-            return Err(Error::file(
-                split,
-                "no samples: every line is blank; expected lines FOLDER FRAME SIDE",
-            ));
+            return Err(Error::file(split, "no samples: every line is blank; expected lines FOLDER FRAME SIDE"));
         }
         for line in lines {
-            let at =
-                |message: String| Error::file(split, format!("line {}: {message}", line.number));
+            let at = |message: String| Error::file(split, format!("line {}: {message}", line.number));
             let drive = match drives.get(&line.folder) {
                 Some(&drive) => drive,
                 None => {
                     let path = root.join(&line.folder);
                     if !path.is_dir() {
-                        return Err(at(format!(
-                            "no such drive: expected the folder {}",
-                            path.display()
-                        )));
+                        return Err(at(format!("no such drive: expected the folder {}", path.display())));
                     }
                     self.add_drive(&line.folder, path, &mut days)?;
                     drives.insert(line.folder.clone(), self.drives.len() - 1);
                     self.drives.len() - 1
                 }
             };
-            let frame = Frame {
-                drive,
-                number: line.frame,
-                side: line.side,
-            };
-            self.check_sample(frame, &mut checked)
-                .map_err(|e| at(e.to_string()))?;
+            let frame = Frame { drive, number: line.frame, side: line.side };
+            self.check_sample(frame, &mut checked).map_err(|e| at(e.to_string()))?;
             self.samples.push(frame);
         }
         Ok(())
@@ -243,14 +210,8 @@ impl Kitti {
             self.add_drive(&folder, path, &mut days)?;
             let drive = self.drives.len() - 1;
             for side in [Side::Left, Side::Right] {
-                for number in
-                    scan::frames(&self.drives[drive].path.join(side.folder()).join("data"))?
-                {
-                    let frame = Frame {
-                        drive,
-                        number,
-                        side,
-                    };
+                for number in scan::frames(&self.drives[drive].path.join(side.folder()).join("data"))? {
+                    let frame = Frame { drive, number, side };
                     if self.has_all(frame) {
                         self.check_sample(frame, &mut checked)?;
                         self.samples.push(frame);
@@ -259,11 +220,7 @@ impl Kitti {
             }
         }
         if self.samples.is_empty() {
-            let wanted = if self.options.neighbours {
-                " with both neighbours"
-            } else {
-                ""
-            };
+            let wanted = if self.options.neighbours { " with both neighbours" } else { "" };
             let message = format!(
                 "no frames{wanted} found in the layout of KITTI raw; expected files like \
                  DATE/DRIVE/image_02/data/0000000000.png"
@@ -279,21 +236,14 @@ impl Kitti {
         path: PathBuf,
         days: &mut HashMap<PathBuf, Option<Arc<Calibration>>>,
     ) -> Result<()> {
-        let mut drive = Drive {
-            folder: folder.to_owned(),
-            path,
-            calibration: None,
-        };
+        let mut drive = Drive { folder: folder.to_owned(), path, calibration: None };
         let day = drive.day().to_owned();
         let camera_needs_it = self.options.camera == Camera::Calibrated;
         let scans_need_it = matches!(self.options.ground_truth, GroundTruth::Lidar(_));
         let auto = self.options.ground_truth == GroundTruth::Auto;
         if camera_needs_it || scans_need_it || (auto && Calibration::is_in(&day)) {
             if !days.contains_key(&day) {
-                days.insert(
-                    day.clone(),
-                    Some(Arc::new(Calibration::read(&day, scans_need_it || auto)?)),
-                );
+                days.insert(day.clone(), Some(Arc::new(Calibration::read(&day, scans_need_it || auto)?)));
             }
             drive.calibration = days[&day].clone();
         }
@@ -303,27 +253,15 @@ impl Kitti {
 
     /// The frames that a sample needs.
     fn needed(&self, frame: Frame) -> impl Iterator<Item = Option<Frame>> {
-        let offsets: &[i32] = if self.options.neighbours {
-            &[0, -1, 1]
-        } else {
-            &[0]
-        };
-        let other = Frame {
-            side: frame.side.other(),
-            ..frame
-        };
-        offsets
-            .iter()
-            .map(move |&offset| frame.at(offset))
-            .chain(self.options.stereo.then_some(Some(other)))
+        let offsets: &[i32] = if self.options.neighbours { &[0, -1, 1] } else { &[0] };
+        let other = Frame { side: frame.side.other(), ..frame };
+        offsets.iter().map(move |&offset| frame.at(offset)).chain(self.options.stereo.then_some(Some(other)))
     }
 
     /// Whether a frame that was found, not listed, is a sample: everything it needs is there.
     fn has_all(&self, frame: Frame) -> bool {
         let drive = &self.drives[frame.drive];
-        let pictures = self
-            .needed(frame)
-            .all(|f| f.is_some_and(|f| drive.picture(f.number, f.side).is_ok()));
+        let pictures = self.needed(frame).all(|f| f.is_some_and(|f| drive.picture(f.number, f.side).is_ok()));
         pictures
             && match self.options.ground_truth {
                 GroundTruth::Improved => drive.depth_png(frame).is_file(),
@@ -337,10 +275,7 @@ impl Kitti {
         let drive = &self.drives[frame.drive];
         for needed in self.needed(frame) {
             let Some(needed) = needed else {
-                let message = format!(
-                    "frame {} has no previous frame; take it off the list",
-                    frame.number
-                );
+                let message = format!("frame {} has no previous frame; take it off the list", frame.number);
                 return Err(Error::file(&drive.path, message));
             };
             if !checked.contains(&needed) {
@@ -360,19 +295,17 @@ impl Kitti {
 
     /// The file of `frame`; where there is none the message says what it is to `target`.
     fn picture_path(&self, frame: Frame, target: Frame) -> Result<PathBuf> {
-        self.drives[frame.drive]
-            .picture(frame.number, frame.side)
-            .map_err(|expected| {
-                let what = match i64::from(frame.number) - i64::from(target.number) {
-                    _ if frame.side != target.side => "the other camera's frame".to_owned(),
-                    0 => "the frame".to_owned(),
-                    -1 => format!("the frame before frame {}", target.number),
-                    1 => format!("the frame after frame {}", target.number),
-                    offset => format!("the frame at {offset:+} of frame {}", target.number),
-                };
-                let message = format!("{what} is missing; expected this file or the same as .jpg");
-                Error::file(expected, message)
-            })
+        self.drives[frame.drive].picture(frame.number, frame.side).map_err(|expected| {
+            let what = match i64::from(frame.number) - i64::from(target.number) {
+                _ if frame.side != target.side => "the other camera's frame".to_owned(),
+                0 => "the frame".to_owned(),
+                -1 => format!("the frame before frame {}", target.number),
+                1 => format!("the frame after frame {}", target.number),
+                offset => format!("the frame at {offset:+} of frame {}", target.number),
+            };
+            let message = format!("{what} is missing; expected this file or the same as .jpg");
+            Error::file(expected, message)
+        })
     }
 
     /// The file of the frame at `offset` of a sample.
@@ -396,13 +329,7 @@ impl Kitti {
     /// The target frame of a sample as the other camera saw it, at the size the networks see.
     pub fn other_camera(&self, sample: usize) -> Result<Arc<RgbImage>> {
         let target = self.samples[sample];
-        self.picture(
-            Frame {
-                side: target.side.other(),
-                ..target
-            },
-            target,
-        )
+        self.picture(Frame { side: target.side.other(), ..target }, target)
     }
 
     fn picture(&self, frame: Frame, target: Frame) -> Result<Arc<RgbImage>> {
@@ -432,17 +359,11 @@ impl Kitti {
     fn scan_depth(&self, frame: Frame, axis: DepthAxis) -> Result<DepthMap> {
         let drive = &self.drives[frame.drive];
         let Some(calibration) = &drive.calibration else {
-            return Err(Error::file(
-                drive.day(),
-                "a LiDAR scan needs calib_cam_to_cam.txt and calib_velo_to_cam.txt",
-            ));
+            return Err(Error::file(drive.day(), "a LiDAR scan needs calib_cam_to_cam.txt and calib_velo_to_cam.txt"));
         };
-        let projection = calibration.lidar_to_image(frame.side).ok_or_else(|| {
-            Error::file(
-                drive.day(),
-                "a LiDAR scan needs calib_velo_to_cam.txt, which was not read",
-            )
-        })?;
+        let projection = calibration
+            .lidar_to_image(frame.side)
+            .ok_or_else(|| Error::file(drive.day(), "a LiDAR scan needs calib_velo_to_cam.txt, which was not read"))?;
         let points = read_scan(&drive.scan(frame))?;
         let (width, height) = calibration.size;
         Ok(project_scan(&points, &projection, width, height, axis))
@@ -457,12 +378,7 @@ impl Dataset for Kitti {
     /// As the line of a split list: `FOLDER FRAME SIDE`.
     fn name(&self, sample: usize) -> String {
         let frame = self.samples[sample];
-        format!(
-            "{} {} {}",
-            self.drives[frame.drive].folder,
-            frame.number,
-            frame.side.letter()
-        )
+        format!("{} {} {}", self.drives[frame.drive].folder, frame.number, frame.side.letter())
     }
 
     fn image(&self, sample: usize, offset: i32) -> Result<Arc<RgbImage>> {
@@ -485,9 +401,7 @@ impl Dataset for Kitti {
         match self.options.ground_truth {
             GroundTruth::Improved => read_depth_png(&drive.depth_png(frame)).map(Some),
             GroundTruth::Lidar(axis) => self.scan_depth(frame, axis).map(Some),
-            GroundTruth::Auto if drive.depth_png(frame).is_file() => {
-                read_depth_png(&drive.depth_png(frame)).map(Some)
-            }
+            GroundTruth::Auto if drive.depth_png(frame).is_file() => read_depth_png(&drive.depth_png(frame)).map(Some),
             GroundTruth::Auto if drive.calibration.is_some() && drive.scan(frame).is_file() => {
                 self.scan_depth(frame, DepthAxis::CameraZ).map(Some)
             }
@@ -500,18 +414,14 @@ fn present(path: PathBuf, what: &str) -> Result<PathBuf> {
     if path.is_file() {
         return Ok(path);
     }
-    let message =
-        format!("the {what} of this frame is missing; use a list of the frames that have it");
+    let message = format!("the {what} of this frame is missing; use a list of the frames that have it");
     Err(Error::file(path, message))
 }
 
 fn side_of_picture(name: &str, size: usize) -> Result<u32> {
     match u32::try_from(size) {
         Ok(size) if (1..=1 << 14).contains(&size) => Ok(size),
-        _ => Err(Error::setting(
-            name,
-            format!("expected 1 to {} pixels, found {size}", 1 << 14),
-        )),
+        _ => Err(Error::setting(name, format!("expected 1 to {} pixels, found {size}", 1 << 14))),
     }
 }
 

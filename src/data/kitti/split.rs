@@ -61,18 +61,11 @@ pub struct SplitLine {
 pub fn read_split(path: &Path) -> Result<Vec<SplitLine>> {
     let text = fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
     let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
-    let lines = text
-        .lines()
-        .enumerate()
-        .filter(|(_, line)| !line.trim().is_empty());
+    let lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
     lines
         .map(|(i, line)| {
             parse(i + 1, line).map_err(|what| {
-                let message = format!(
-                    "line {}: expected FOLDER FRAME SIDE, {what}: {:?}",
-                    i + 1,
-                    line.trim()
-                );
+                let message = format!("line {}: expected FOLDER FRAME SIDE, {what}: {:?}", i + 1, line.trim());
                 Error::file(path, message)
             })
         })
@@ -84,31 +77,19 @@ fn parse(number: usize, line: &str) -> Result<SplitLine, String> {
     let &[folder, frame, side] = fields.as_slice() else {
         return Err(format!("found {} fields", fields.len()));
     };
-    if !Path::new(folder)
-        .components()
-        .all(|c| matches!(c, Component::Normal(_) | Component::CurDir))
-    {
+    if !Path::new(folder).components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir)) {
         return Err("with a folder inside the data set's".to_owned());
     }
     // Ten digits are the most a file name has.
-    let frame = frame
-        .parse()
-        .map_err(|_| format!("with a frame number like 5 or 0000000005, found {frame:?}"))?;
+    let frame = frame.parse().map_err(|_| format!("with a frame number like 5 or 0000000005, found {frame:?}"))?;
     let side = match side {
         "l" => Side::Left,
         "r" => Side::Right,
         _ => {
-            return Err(format!(
-                "with the side l (image_02) or r (image_03), found {side:?}"
-            ));
+            return Err(format!("with the side l (image_02) or r (image_03), found {side:?}"));
         }
     };
-    Ok(SplitLine {
-        number,
-        folder: folder.to_owned(),
-        frame,
-        side,
-    })
+    Ok(SplitLine { number, folder: folder.to_owned(), frame, side })
 }
 
 #[cfg(test)]
@@ -125,19 +106,8 @@ mod tests {
     #[test]
     fn reads_lines_and_skips_blank_ones() {
         let lines = read("a/b 5 l\r\n\n  \na/c 0000000012 r\n").unwrap();
-        let line = |number, folder: &str, frame, side| SplitLine {
-            number,
-            folder: folder.to_owned(),
-            frame,
-            side,
-        };
-        assert_eq!(
-            lines,
-            [
-                line(1, "a/b", 5, Side::Left),
-                line(4, "a/c", 12, Side::Right)
-            ]
-        );
+        let line = |number, folder: &str, frame, side| SplitLine { number, folder: folder.to_owned(), frame, side };
+        assert_eq!(lines, [line(1, "a/b", 5, Side::Left), line(4, "a/c", 12, Side::Right)]);
         assert!(read("\n").unwrap().is_empty());
     }
 
@@ -154,18 +124,13 @@ mod tests {
             ("a/b 5 l\n\n../b 5 l", "inside"),
         ] {
             let error = read(text).unwrap_err().to_string();
-            assert!(
-                error.contains("split.txt: line 3: ") && error.contains(what),
-                "{error}"
-            );
+            assert!(error.contains("split.txt: line 3: ") && error.contains(what), "{error}");
         }
     }
 
     #[test]
     fn a_list_that_is_not_there_is_an_error() {
-        let error = read_split(Path::new("/nowhere/split.txt"))
-            .unwrap_err()
-            .to_string();
+        let error = read_split(Path::new("/nowhere/split.txt")).unwrap_err().to_string();
         assert!(error.contains("/nowhere/split.txt"), "{error}");
     }
 }
