@@ -1,5 +1,13 @@
 //! Where frames come from: the embedded street, KITTI raw, folders; and what is done to them before training.
 
+pub mod augment;
+pub mod batch;
+pub mod kitti;
+pub mod picture;
+pub mod pyramid;
+pub mod resize;
+pub mod street;
+
 use std::sync::Arc;
 
 use image::RgbImage;
@@ -7,7 +15,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::Result;
 
-pub mod street;
+
 
 /// Pinhole intrinsics in units of the image size, so that they hold at any resolution:
 /// `u = fx * W * x/z + cx * W`, `v = fy * H * y/z + cy * H`, pixel centres at whole numbers.

@@ -4,8 +4,11 @@ pub mod config;
 pub mod decoder;
 pub mod encoder;
 pub mod loss;
+pub mod metrics;
 mod model;
 pub mod pose;
+pub mod trainer;
 
 pub use config::{Config, Preset};
 pub use model::MonoVit;
+pub use trainer::{OptimConfig, StepReport, Trainer};

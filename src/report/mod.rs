@@ -1,1 +1,5 @@
 //! Colour maps, plots, and what a run leaves behind.
+
+pub mod colormap;
+pub mod depth_png;
+pub mod npy;

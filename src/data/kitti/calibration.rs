@@ -1,0 +1,183 @@
+//! The calibration of a day: `calib_cam_to_cam.txt` and `calib_velo_to_cam.txt`, lines `KEY: numbers`.
+
+use std::collections::HashMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use super::Side;
+use crate::data::Intrinsics;
+use crate::{Error, Result};
+
+const CAMERAS: &str = "calib_cam_to_cam.txt";
+const LIDAR: &str = "calib_velo_to_cam.txt";
+
+/// What KITTI's calibration says about the two colour cameras and the LiDAR.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Calibration {
+    /// Width and height of the rectified pictures, `S_rect_02`.
+    pub size: (usize, usize),
+    /// Left and right: width and height (`S_rect_0c`) and the 3x4 projection (`P_rect_0c`), row-major.
+    cameras: [Projection; 2],
+    /// `R_rect_00` times LiDAR to camera 0, 4x4 row-major.
+    lidar_to_rectified: Option<[f64; 16]>,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+struct Projection {
+    size: [f64; 2],
+    matrix: [f64; 12],
+}
+
+impl Calibration {
+    /// Whether the folder of a day has both files.
+    pub fn is_in(day: &Path) -> bool {
+        day.join(CAMERAS).is_file() && day.join(LIDAR).is_file()
+    }
+
+    /// Reads the files in the folder of a day; that of the LiDAR only `with_lidar`.
+    pub fn read(day: &Path, with_lidar: bool) -> Result<Calibration> {
+        let cameras = Entries::read(day.join(CAMERAS))?;
+        let projection = |camera: &str| -> Result<Projection> {
+            Ok(Projection {
+                size: cameras.size(&format!("S_rect_{camera}"))?,
+                matrix: cameras.numbers(&format!("P_rect_{camera}"))?,
+            })
+        };
+        let cameras_of_sides = [projection("02")?, projection("03")?];
+        let [width, height] = cameras_of_sides[0].size;
+        let lidar_to_rectified = match with_lidar {
+            false => None,
+            true => {
+                let lidar = Entries::read(day.join(LIDAR))?;
+                let rectify = rigid(cameras.numbers("R_rect_00")?, [0.0; 3]);
+                Some(product(&rectify, &rigid(lidar.numbers("R")?, lidar.numbers("T")?)))
+            }
+        };
+        Ok(Calibration { size: (width as usize, height as usize), cameras: cameras_of_sides, lidar_to_rectified })
+    }
+
+    fn camera(&self, side: Side) -> &Projection {
+        match side {
+            Side::Left => &self.cameras[0],
+            Side::Right => &self.cameras[1],
+        }
+    }
+
+    /// The measured intrinsics: `P_rect` over `S_rect`.
+    pub fn intrinsics(&self, side: Side) -> Intrinsics {
+        let Projection { size: [width, height], matrix: p } = self.camera(side);
+        Intrinsics { fx: p[0] / width, fy: p[5] / height, cx: p[2] / width, cy: p[6] / height }
+    }
+
+    /// `P_rect_0c R_rect_00 Tr`, 3x4 row-major: from LiDAR coordinates (metres; x forward, y left, z up) to
+    /// homogeneous pixels, whose third coordinate is camera z. `None` if the calibration was read without the LiDAR.
+    pub fn lidar_to_image(&self, side: Side) -> Option<[f64; 12]> {
+        Some(product(&self.camera(side).matrix, self.lidar_to_rectified.as_ref()?))
+    }
+}
+
+/// `[R | t]` with the last row 0 0 0 1.
+fn rigid(r: [f64; 9], t: [f64; 3]) -> [f64; 16] {
+    let [a, b, c, d, e, f, g, h, i] = r;
+    [a, b, c, t[0], d, e, f, t[1], g, h, i, t[2], 0.0, 0.0, 0.0, 1.0]
+}
+
+/// `a b` for a matrix `a` of rows of four (3x4 or 4x4) and a 4x4 matrix `b`.
+fn product<const N: usize>(a: &[f64; N], b: &[f64; 16]) -> [f64; N] {
+    std::array::from_fn(|i| (0..4).map(|k| a[i / 4 * 4 + k] * b[4 * k + i % 4]).sum())
+}
+
+/// The lines of a calibration file.
+struct Entries {
+    path: PathBuf,
+    values: HashMap<String, String>,
+}
+
+impl Entries {
+    fn read(path: PathBuf) -> Result<Entries> {
+        let text = fs::read_to_string(&path).map_err(|e| Error::io(&path, e))?;
+        let entry = |line: &str| line.split_once(':').map(|(k, v)| (k.trim().to_owned(), v.trim().to_owned()));
+        Ok(Entries { values: text.lines().filter_map(entry).collect(), path })
+    }
+
+    /// The `N` finite numbers of a key.
+    fn numbers<const N: usize>(&self, key: &str) -> Result<[f64; N]> {
+        let wrong = |found: String| Error::file(&self.path, format!("{key}: expected {N} numbers, found {found}"));
+        let text = self.values.get(key).ok_or_else(|| wrong("no such line".to_owned()))?;
+        let number = |word: &str| match word.parse::<f64>() {
+            Ok(number) if number.is_finite() => Ok(number),
+            _ => Err(wrong(format!("{word:?}"))),
+        };
+        let numbers = text.split_whitespace().map(number).collect::<Result<Vec<f64>>>()?;
+        <[f64; N]>::try_from(numbers).map_err(|numbers| wrong(numbers.len().to_string()))
+    }
+
+    /// Width and height: whole numbers of pixels.
+    fn size(&self, key: &str) -> Result<[f64; 2]> {
+        let size: [f64; 2] = self.numbers(key)?;
+        match size.iter().all(|n| (1.0..=16384.0).contains(n) && n.fract() == 0.0) {
+            true => Ok(size),
+            false => {
+                Err(Error::file(&self.path, format!("{key}: expected width and height in pixels, found {size:?}")))
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CAMERA_LINES: [&str; 5] = [
+        "S_rect_02: 1.242e+03 3.75e+02",
+        "S_rect_03: 1.242e+03 3.75e+02",
+        "R_rect_00: 1 0 0 0 1 0 0 0 1",
+        "P_rect_02: 700 0 600 45 0 710 170 0.2 0 0 1 0.003",
+        "P_rect_03: 700 0 610 -339 0 710 180 2.2 0 0 1 0.003",
+    ];
+
+    fn day(camera_lines: &[&str], lidar: &str) -> tempfile::TempDir {
+        let day = tempfile::tempdir().unwrap();
+        let lines = format!("calib_time: 09-Jan-2012 13:57:47\n{}\n", camera_lines.join("\n"));
+        fs::write(day.path().join(CAMERAS), lines).unwrap();
+        fs::write(day.path().join(LIDAR), lidar).unwrap();
+        day
+    }
+
+    #[test]
+    fn reads_intrinsics_and_projection() {
+        // The LiDAR's axes turned to the camera's: z forward is x, x right is -y, y down is -z.
+        let day = day(&CAMERA_LINES, "R: 0 -1 0 0 0 -1 1 0 0\nT: 0.5 -0.25 -0.125\n");
+        let calibration = Calibration::read(day.path(), true).unwrap();
+        assert_eq!(calibration.size, (1242, 375));
+        let left = calibration.intrinsics(Side::Left);
+        assert_eq!((left.fx, left.cx), (700.0 / 1242.0, 600.0 / 1242.0));
+        assert_eq!((left.fy, left.cy), (710.0 / 375.0, 170.0 / 375.0));
+        assert_eq!(calibration.intrinsics(Side::Right).cx, 610.0 / 1242.0);
+        let p = calibration.lidar_to_image(Side::Left).unwrap();
+        // A point at (10, 2, 1): camera (-2 + 0.5, -1 - 0.25, 10 - 0.125).
+        let q: Vec<f64> = p.as_chunks::<4>().0.iter().map(|r| r[0] * 10.0 + r[1] * 2.0 + r[2] + r[3]).collect();
+        let expected = [700.0 * -1.5 + 600.0 * 9.875 + 45.0, 710.0 * -1.25 + 170.0 * 9.875 + 0.2, 9.878];
+        for (a, b) in q.iter().zip(expected) {
+            assert!((a - b).abs() < 1e-9, "{a} {b}");
+        }
+    }
+
+    #[test]
+    fn messages_name_file_key_and_number() {
+        for (i, line, what) in [
+            (0, "", "S_rect_02: expected 2 numbers, found no such line"),
+            (3, "P_rect_02: 1 2 3", "P_rect_02: expected 12 numbers, found 3"),
+            (4, "P_rect_03: 700 0 x -339 0 710 180 2.2 0 0 1 0.003", "found \"x\""),
+            (1, "S_rect_03: 0 375", "S_rect_03: expected width and height"),
+        ] {
+            let mut lines = CAMERA_LINES;
+            lines[i] = line;
+            let day = day(&lines, "");
+            let error = Calibration::read(day.path(), false).unwrap_err().to_string();
+            assert!(error.contains(CAMERAS) && error.contains(what), "{error}");
+        }
+        let error = Calibration::read(day(&CAMERA_LINES, "R: 1\n").path(), true).unwrap_err().to_string();
+        assert!(error.contains(LIDAR) && error.contains("R: expected 9 numbers, found 1"), "{error}");
+    }
+}

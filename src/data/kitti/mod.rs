@@ -1,0 +1,429 @@
+//! KITTI raw, in its own layout:
+//!
+//! ```text
+//! ROOT/DATE/calib_cam_to_cam.txt, calib_velo_to_cam.txt
+//! ROOT/DATE/DRIVE/image_02/data/0000000005.png (or .jpg); image_03 is the right camera
+//! ROOT/DATE/DRIVE/proj_depth/groundtruth/image_02/0000000005.png
+//! ROOT/DATE/DRIVE/velodyne_points/data/0000000005.bin
+//! ```
+//!
+//! Whatever can be wrong with a data set is found by [`Kitti::open`], before any time is spent on training.
+
+mod calibration;
+mod depth_png;
+mod lidar;
+mod scan;
+mod split;
+
+use std::collections::{HashMap, HashSet};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use image::RgbImage;
+
+pub use calibration::Calibration;
+pub use depth_png::read_depth_png;
+pub use lidar::{DepthAxis, project_scan, read_scan};
+pub use split::{Side, SplitLine, read_split};
+
+use super::picture::{check_picture, read_picture};
+use super::resize::lanczos;
+use super::{Dataset, DepthMap, Intrinsics};
+use crate::{Error, Result};
+
+/// Whose intrinsics the samples carry.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Camera {
+    /// The constants of the published training, whatever the drive: [`Intrinsics::KITTI`].
+    #[default]
+    Published,
+    /// `P_rect_02` or `P_rect_03` of the day's `calib_cam_to_cam.txt`, over `S_rect`.
+    Calibrated,
+}
+
+/// Where ground-truth depth comes from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum GroundTruth {
+    /// For every frame the first of these that is there: the depth PNG, the projected scan (camera z), none.
+    #[default]
+    Auto,
+    /// The improved ground truth, `proj_depth/groundtruth`: every sample must have it.
+    Improved,
+    /// The projected LiDAR scan: every sample must have it, and its day the calibration.
+    Lidar(DepthAxis),
+    /// None.
+    Off,
+}
+
+/// How a data set is opened.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Options {
+    /// Every sample needs its previous and next frame (training); otherwise the target frame alone (evaluation).
+    pub neighbours: bool,
+    /// Every sample needs the frame of the other camera ([`Kitti::other_camera`]).
+    pub stereo: bool,
+    /// Whose intrinsics.
+    pub camera: Camera,
+    /// Which depth.
+    pub ground_truth: GroundTruth,
+    /// How many bytes of resized pictures are kept in memory; beyond them frames are decoded each time.
+    pub cache_bytes: usize,
+}
+
+impl Default for Options {
+    /// For training: with neighbours, published camera, any depth there is, a cache of 1 GiB.
+    fn default() -> Self {
+        Options {
+            neighbours: true,
+            stereo: false,
+            camera: Camera::Published,
+            ground_truth: GroundTruth::Auto,
+            cache_bytes: 1 << 30,
+        }
+    }
+}
+
+/// One frame of one camera of one drive.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+struct Frame {
+    /// Index of the drive.
+    drive: usize,
+    number: u32,
+    side: Side,
+}
+
+impl Frame {
+    fn at(self, offset: i32) -> Option<Frame> {
+        Some(Frame { number: self.number.checked_add_signed(offset)?, ..self })
+    }
+}
+
+/// A drive: one recording.
+struct Drive {
+    /// As in split lists, `DATE/DRIVE`.
+    folder: String,
+    path: PathBuf,
+    /// The calibration of its day, where something needs it.
+    calibration: Option<Arc<Calibration>>,
+}
+
+impl Drive {
+    /// The file of a frame, PNG before JPEG; the PNG's path as the error where neither is there.
+    fn picture(&self, number: u32, side: Side) -> Result<PathBuf, PathBuf> {
+        let folder = self.path.join(side.folder()).join("data");
+        let with = |extension: &str| folder.join(format!("{number:010}.{extension}"));
+        ["png", "jpg"].into_iter().map(with).find(|path| path.is_file()).ok_or_else(|| with("png"))
+    }
+
+    fn depth_png(&self, frame: Frame) -> PathBuf {
+        let folder = self.path.join("proj_depth/groundtruth").join(frame.side.folder());
+        folder.join(format!("{:010}.png", frame.number))
+    }
+
+    fn scan(&self, frame: Frame) -> PathBuf {
+        self.path.join("velodyne_points/data").join(format!("{:010}.bin", frame.number))
+    }
+
+    /// The folder of the day, which holds the calibration.
+    fn day(&self) -> &Path {
+        self.path.parent().unwrap_or(&self.path)
+    }
+}
+
+/// Frames kept at the size of the networks, up to a number of bytes; what is in stays in.
+#[derive(Default)]
+struct Cache {
+    pictures: HashMap<Frame, Arc<RgbImage>>,
+    bytes: usize,
+}
+
+/// KITTI raw as a [`Dataset`].
+pub struct Kitti {
+    drives: Vec<Drive>,
+    samples: Vec<Frame>,
+    height: u32,
+    width: u32,
+    options: Options,
+    cache: Mutex<Cache>,
+}
+
+impl Kitti {
+    /// Opens the samples that `split` lists (lines `FOLDER FRAME SIDE`), or all that are under `root`: left and right
+    /// camera, frames in order, those that have what `options` ask for. Pictures come out at `height x width` pixels.
+    ///
+    /// # Errors
+    /// Everything is checked here: lines that cannot be read or that point nowhere (with file and line number),
+    /// missing neighbours, pictures whose header does not decode or that exceed 100 megapixels, missing or malformed
+    /// calibration and ground truth where they are asked for.
+    pub fn open(root: &Path, split: Option<&Path>, height: usize, width: usize, options: Options) -> Result<Kitti> {
+        if !root.is_dir() {
+            return Err(Error::file(root, "expected a folder in the layout of KITTI raw, found none; check the path"));
+        }
+        let mut kitti = Kitti {
+            drives: Vec::new(),
+            samples: Vec::new(),
+            height: side_of_picture("height", height)?,
+            width: side_of_picture("width", width)?,
+            options,
+            cache: Mutex::default(),
+        };
+        match split {
+            Some(split) => kitti.take_split(root, split)?,
+            None => kitti.take_everything(root)?,
+        }
+        Ok(kitti)
+    }
+
+    fn take_split(&mut self, root: &Path, split: &Path) -> Result<()> {
+        let mut drives = HashMap::new();
+        let mut days = HashMap::new();
+        let mut checked = HashSet::new();
+        let lines = read_split(split)?;
+        if lines.is_empty() {
+            return Err(Error::file(split, "no samples: every line is blank; expected lines FOLDER FRAME SIDE"));
+        }
+        for line in lines {
+            let at = |message: String| Error::file(split, format!("line {}: {message}", line.number));
+            let drive = match drives.get(&line.folder) {
+                Some(&drive) => drive,
+                None => {
+                    let path = root.join(&line.folder);
+                    if !path.is_dir() {
+                        return Err(at(format!("no such drive: expected the folder {}", path.display())));
+                    }
+                    self.add_drive(&line.folder, path, &mut days)?;
+                    drives.insert(line.folder.clone(), self.drives.len() - 1);
+                    self.drives.len() - 1
+                }
+            };
+            let frame = Frame { drive, number: line.frame, side: line.side };
+            self.check_sample(frame, &mut checked).map_err(|e| at(e.to_string()))?;
+            self.samples.push(frame);
+        }
+        Ok(())
+    }
+
+    fn take_everything(&mut self, root: &Path) -> Result<()> {
+        let mut days = HashMap::new();
+        let mut checked = HashSet::new();
+        for (folder, path) in scan::drives(root)? {
+            self.add_drive(&folder, path, &mut days)?;
+            let drive = self.drives.len() - 1;
+            for side in [Side::Left, Side::Right] {
+                for number in scan::frames(&self.drives[drive].path.join(side.folder()).join("data"))? {
+                    let frame = Frame { drive, number, side };
+                    if self.has_all(frame) {
+                        self.check_sample(frame, &mut checked)?;
+                        self.samples.push(frame);
+                    }
+                }
+            }
+        }
+        if self.samples.is_empty() {
+            let wanted = if self.options.neighbours { " with both neighbours" } else { "" };
+            let message = format!(
+                "no frames{wanted} found in the layout of KITTI raw; expected files like \
+                 DATE/DRIVE/image_02/data/0000000000.png"
+            );
+            return Err(Error::file(root, message));
+        }
+        Ok(())
+    }
+
+    fn add_drive(
+        &mut self,
+        folder: &str,
+        path: PathBuf,
+        days: &mut HashMap<PathBuf, Option<Arc<Calibration>>>,
+    ) -> Result<()> {
+        let mut drive = Drive { folder: folder.to_owned(), path, calibration: None };
+        let day = drive.day().to_owned();
+        let camera_needs_it = self.options.camera == Camera::Calibrated;
+        let scans_need_it = matches!(self.options.ground_truth, GroundTruth::Lidar(_));
+        let auto = self.options.ground_truth == GroundTruth::Auto;
+        if camera_needs_it || scans_need_it || (auto && Calibration::is_in(&day)) {
+            if !days.contains_key(&day) {
+                days.insert(day.clone(), Some(Arc::new(Calibration::read(&day, scans_need_it || auto)?)));
+            }
+            drive.calibration = days[&day].clone();
+        }
+        self.drives.push(drive);
+        Ok(())
+    }
+
+    /// The frames that a sample needs.
+    fn needed(&self, frame: Frame) -> impl Iterator<Item = Option<Frame>> {
+        let offsets: &[i32] = if self.options.neighbours { &[0, -1, 1] } else { &[0] };
+        let other = Frame { side: frame.side.other(), ..frame };
+        offsets.iter().map(move |&offset| frame.at(offset)).chain(self.options.stereo.then_some(Some(other)))
+    }
+
+    /// Whether a frame that was found, not listed, is a sample: everything it needs is there.
+    fn has_all(&self, frame: Frame) -> bool {
+        let drive = &self.drives[frame.drive];
+        let pictures = self.needed(frame).all(|f| f.is_some_and(|f| drive.picture(f.number, f.side).is_ok()));
+        pictures
+            && match self.options.ground_truth {
+                GroundTruth::Improved => drive.depth_png(frame).is_file(),
+                GroundTruth::Lidar(_) => drive.scan(frame).is_file(),
+                GroundTruth::Auto | GroundTruth::Off => true,
+            }
+    }
+
+    /// Checks all that a sample needs; `checked` remembers the pictures that several samples share.
+    fn check_sample(&self, frame: Frame, checked: &mut HashSet<Frame>) -> Result<()> {
+        let drive = &self.drives[frame.drive];
+        for needed in self.needed(frame) {
+            let Some(needed) = needed else {
+                let message = format!("frame {} has no previous frame; take it off the list", frame.number);
+                return Err(Error::file(&drive.path, message));
+            };
+            if !checked.contains(&needed) {
+                check_picture(&self.picture_path(needed, frame)?)?;
+                checked.insert(needed);
+            }
+        }
+        match self.options.ground_truth {
+            GroundTruth::Improved => {
+                check_picture(&present(drive.depth_png(frame), "improved ground truth")?)?;
+            }
+            GroundTruth::Lidar(_) => lidar::check_scan(&present(drive.scan(frame), "LiDAR scan")?)?,
+            GroundTruth::Auto | GroundTruth::Off => {}
+        }
+        Ok(())
+    }
+
+    /// The file of `frame`; where there is none the message says what it is to `target`.
+    fn picture_path(&self, frame: Frame, target: Frame) -> Result<PathBuf> {
+        self.drives[frame.drive].picture(frame.number, frame.side).map_err(|expected| {
+            let what = match i64::from(frame.number) - i64::from(target.number) {
+                _ if frame.side != target.side => "the other camera's frame".to_owned(),
+                0 => "the frame".to_owned(),
+                -1 => format!("the frame before frame {}", target.number),
+                1 => format!("the frame after frame {}", target.number),
+                offset => format!("the frame at {offset:+} of frame {}", target.number),
+            };
+            let message = format!("{what} is missing; expected this file or the same as .jpg");
+            Error::file(expected, message)
+        })
+    }
+
+    /// The file of the frame at `offset` of a sample.
+    pub fn path(&self, sample: usize, offset: i32) -> Result<PathBuf> {
+        let target = self.samples[sample];
+        self.picture_path(self.at(target, offset)?, target)
+    }
+
+    fn at(&self, target: Frame, offset: i32) -> Result<Frame> {
+        target.at(offset).ok_or_else(|| {
+            let message = format!("frame {} has no frame at {offset:+}", target.number);
+            Error::file(&self.drives[target.drive].path, message)
+        })
+    }
+
+    /// Which camera a sample was taken with.
+    pub fn side(&self, sample: usize) -> Side {
+        self.samples[sample].side
+    }
+
+    /// The target frame of a sample as the other camera saw it, at the size the networks see.
+    pub fn other_camera(&self, sample: usize) -> Result<Arc<RgbImage>> {
+        let target = self.samples[sample];
+        self.picture(Frame { side: target.side.other(), ..target }, target)
+    }
+
+    fn picture(&self, frame: Frame, target: Frame) -> Result<Arc<RgbImage>> {
+        if let Some(picture) = self.cache().pictures.get(&frame) {
+            return Ok(picture.clone());
+        }
+        let picture = read_picture(&self.picture_path(frame, target)?)?;
+        let picture = Arc::new(match picture.dimensions() == (self.width, self.height) {
+            true => picture,
+            false => lanczos(&picture, self.width, self.height),
+        });
+        let bytes = picture.as_raw().len();
+        let mut cache = self.cache();
+        // Another thread may have decoded it in the meantime.
+        if cache.bytes + bytes <= self.options.cache_bytes && !cache.pictures.contains_key(&frame) {
+            cache.pictures.insert(frame, picture.clone());
+            cache.bytes += bytes;
+        }
+        Ok(picture)
+    }
+
+    /// A thread that panicked with the lock held leaves whole entries behind: they can be used.
+    fn cache(&self) -> std::sync::MutexGuard<'_, Cache> {
+        self.cache.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn scan_depth(&self, frame: Frame, axis: DepthAxis) -> Result<DepthMap> {
+        let drive = &self.drives[frame.drive];
+        let Some(calibration) = &drive.calibration else {
+            return Err(Error::file(drive.day(), "a LiDAR scan needs calib_cam_to_cam.txt and calib_velo_to_cam.txt"));
+        };
+        let projection = calibration
+            .lidar_to_image(frame.side)
+            .ok_or_else(|| Error::file(drive.day(), "a LiDAR scan needs calib_velo_to_cam.txt, which was not read"))?;
+        let points = read_scan(&drive.scan(frame))?;
+        let (width, height) = calibration.size;
+        Ok(project_scan(&points, &projection, width, height, axis))
+    }
+}
+
+impl Dataset for Kitti {
+    fn len(&self) -> usize {
+        self.samples.len()
+    }
+
+    /// As the line of a split list: `FOLDER FRAME SIDE`.
+    fn name(&self, sample: usize) -> String {
+        let frame = self.samples[sample];
+        format!("{} {} {}", self.drives[frame.drive].folder, frame.number, frame.side.letter())
+    }
+
+    fn image(&self, sample: usize, offset: i32) -> Result<Arc<RgbImage>> {
+        let target = self.samples[sample];
+        self.picture(self.at(target, offset)?, target)
+    }
+
+    fn intrinsics(&self, sample: usize) -> Intrinsics {
+        let frame = self.samples[sample];
+        match (self.options.camera, &self.drives[frame.drive].calibration) {
+            (Camera::Calibrated, Some(calibration)) => calibration.intrinsics(frame.side),
+            // A calibrated data set does not open without its calibration.
+            _ => Intrinsics::KITTI,
+        }
+    }
+
+    fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {
+        let frame = self.samples[sample];
+        let drive = &self.drives[frame.drive];
+        match self.options.ground_truth {
+            GroundTruth::Improved => read_depth_png(&drive.depth_png(frame)).map(Some),
+            GroundTruth::Lidar(axis) => self.scan_depth(frame, axis).map(Some),
+            GroundTruth::Auto if drive.depth_png(frame).is_file() => read_depth_png(&drive.depth_png(frame)).map(Some),
+            GroundTruth::Auto if drive.calibration.is_some() && drive.scan(frame).is_file() => {
+                self.scan_depth(frame, DepthAxis::CameraZ).map(Some)
+            }
+            GroundTruth::Auto | GroundTruth::Off => Ok(None),
+        }
+    }
+}
+
+fn present(path: PathBuf, what: &str) -> Result<PathBuf> {
+    if path.is_file() {
+        return Ok(path);
+    }
+    let message = format!("the {what} of this frame is missing; use a list of the frames that have it");
+    Err(Error::file(path, message))
+}
+
+fn side_of_picture(name: &str, size: usize) -> Result<u32> {
+    match u32::try_from(size) {
+        Ok(size) if (1..=1 << 14).contains(&size) => Ok(size),
+        _ => Err(Error::setting(name, format!("expected 1 to {} pixels, found {size}", 1 << 14))),
+    }
+}
+
+#[cfg(test)]
+mod tests;

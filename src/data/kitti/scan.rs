@@ -1,0 +1,84 @@
+//! Finds drives and frames where no list names them.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::{Error, Result};
+
+/// Drives lie at most this many folders below the root: `DATE/DRIVE`.
+const DEPTH: usize = 2;
+
+/// The drives under `root` in the order of their names, each with its folder as split lists write it: every folder
+/// that has frames of a colour camera.
+pub fn drives(root: &Path) -> Result<Vec<(String, PathBuf)>> {
+    let mut found = Vec::new();
+    visit(root, "", DEPTH, &mut found)?;
+    Ok(found)
+}
+
+fn visit(folder: &Path, name: &str, depth: usize, found: &mut Vec<(String, PathBuf)>) -> Result<()> {
+    if ["image_02", "image_03"].iter().any(|camera| folder.join(camera).join("data").is_dir()) {
+        found.push((if name.is_empty() { "." } else { name }.to_owned(), folder.to_owned()));
+        return Ok(());
+    }
+    if depth == 0 {
+        return Ok(());
+    }
+    let children: BTreeSet<String> = entries(folder)?.filter(|child| folder.join(child).is_dir()).collect();
+    for child in children {
+        let name = if name.is_empty() { child.clone() } else { format!("{name}/{child}") };
+        visit(&folder.join(&child), &name, depth - 1, found)?;
+    }
+    Ok(())
+}
+
+/// The numbers of the frames in a camera's `data` folder, in order; none if the folder is not there. Files that are
+/// not named ten digits and `.png` or `.jpg` are something else.
+pub fn frames(folder: &Path) -> Result<BTreeSet<u32>> {
+    if !folder.is_dir() {
+        return Ok(BTreeSet::new());
+    }
+    let number = |name: String| {
+        let (stem, extension) = name.rsplit_once('.')?;
+        (stem.len() == 10 && ["png", "jpg"].contains(&extension)).then(|| stem.parse().ok())?
+    };
+    Ok(entries(folder)?.filter_map(number).collect())
+}
+
+/// The names in a folder; those that are not Unicode cannot be KITTI's.
+fn entries(folder: &Path) -> Result<impl Iterator<Item = String>> {
+    let entries: Vec<_> =
+        fs::read_dir(folder).and_then(Iterator::collect).map_err(|e: std::io::Error| Error::io(folder, e))?;
+    let entries: Vec<fs::DirEntry> = entries;
+    Ok(entries.into_iter().filter_map(|entry| entry.file_name().into_string().ok()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn finds_drives_and_frames_in_order() {
+        let root = tempfile::tempdir().unwrap();
+        for name in ["day/b/image_02/data", "day/a/image_03/data", "day/c/image_00/data", "splits"] {
+            fs::create_dir_all(root.path().join(name)).unwrap();
+        }
+        let data = root.path().join("day/b/image_02/data");
+        for name in ["0000000010.png", "0000000002.jpg", "0000000003.txt", "12.png", "00000000x4.png"] {
+            fs::write(data.join(name), b"").unwrap();
+        }
+        let names: Vec<String> = drives(root.path()).unwrap().into_iter().map(|(name, _)| name).collect();
+        assert_eq!(names, ["day/a", "day/b"]);
+        assert_eq!(frames(&data).unwrap().into_iter().collect::<Vec<_>>(), [2, 10]);
+        assert!(frames(&root.path().join("nowhere")).unwrap().is_empty());
+    }
+
+    #[test]
+    fn a_day_or_a_drive_may_be_the_root() {
+        let root = tempfile::tempdir().unwrap();
+        fs::create_dir_all(root.path().join("day/b/image_02/data")).unwrap();
+        assert_eq!(drives(&root.path().join("day")).unwrap()[0].0, "b");
+        assert_eq!(drives(&root.path().join("day/b")).unwrap()[0].0, ".");
+    }
+}

@@ -1,0 +1,239 @@
+//! Data sets made here, and the real piece where it is named.
+
+use std::fs;
+
+use image::Rgb;
+
+use super::*;
+use crate::report::depth_png::write_depth_png;
+use crate::test_support::{fixture_bytes, kitti};
+
+/// Writes a drive `day/drive` with frames `numbers` of both cameras, 24x16.
+fn made_up(numbers: std::ops::Range<u32>) -> tempfile::TempDir {
+    let root = tempfile::tempdir().unwrap();
+    for (camera, blue) in [("image_02", 20), ("image_03", 90)] {
+        let folder = root.path().join("day/drive").join(camera).join("data");
+        fs::create_dir_all(&folder).unwrap();
+        for number in numbers.clone() {
+            let picture = RgbImage::from_pixel(24, 16, Rgb([number as u8 * 10, 200, blue]));
+            picture.save(folder.join(format!("{number:010}.png"))).unwrap();
+        }
+    }
+    root
+}
+
+fn split(root: &Path, text: &str) -> PathBuf {
+    let path = root.join("split.txt");
+    fs::write(&path, text).unwrap();
+    path
+}
+
+fn names(kitti: &Kitti) -> Vec<String> {
+    (0..kitti.len()).map(|i| kitti.name(i)).collect()
+}
+
+fn open(root: &Path, lines: Option<&str>, options: Options) -> Result<Kitti> {
+    let split = lines.map(|lines| split(root, lines));
+    Kitti::open(root, split.as_deref(), 8, 12, options)
+}
+
+fn message(result: Result<Kitti>) -> String {
+    result.map(|kitti| names(&kitti)).unwrap_err().to_string()
+}
+
+const TARGET_ONLY: Options = Options {
+    neighbours: false,
+    stereo: false,
+    camera: Camera::Published,
+    ground_truth: GroundTruth::Auto,
+    cache_bytes: 0,
+};
+
+#[test]
+fn without_a_list_every_frame_with_both_neighbours_is_a_sample() {
+    let root = made_up(3..7);
+    let kitti = open(root.path(), None, Options::default()).unwrap();
+    assert_eq!(names(&kitti), ["day/drive 4 l", "day/drive 5 l", "day/drive 4 r", "day/drive 5 r"]);
+    assert_eq!(open(root.path(), None, TARGET_ONLY).unwrap().len(), 8);
+    fs::remove_file(root.path().join("day/drive/image_02/data/0000000005.png")).unwrap();
+    assert_eq!(names(&open(root.path(), None, Options::default()).unwrap()), ["day/drive 4 r", "day/drive 5 r"]);
+    let stereo = open(root.path(), None, Options { stereo: true, ..Options::default() }).unwrap();
+    assert_eq!(names(&stereo), ["day/drive 4 r"]);
+}
+
+#[test]
+fn frames_come_at_the_size_asked_for_and_in_the_order_of_time() {
+    let root = made_up(3..7);
+    let kitti = open(root.path(), Some("day/drive 5 r\nday/drive 4 l\n"), Options::default()).unwrap();
+    assert_eq!(names(&kitti), ["day/drive 5 r", "day/drive 4 l"]);
+    for (offset, red) in [(-1, 40), (0, 50), (1, 60)] {
+        let picture = kitti.image(0, offset).unwrap();
+        assert_eq!(picture.dimensions(), (12, 8));
+        assert!(picture.pixels().all(|p| p.0 == [red, 200, 90]));
+    }
+    assert_eq!(kitti.other_camera(0).unwrap().get_pixel(0, 0).0, [50, 200, 20]);
+    assert_eq!(kitti.intrinsics(0), Intrinsics::KITTI);
+    assert_eq!(kitti.depth(0).unwrap(), None);
+    assert!(kitti.path(1, 1).unwrap().ends_with("day/drive/image_02/data/0000000005.png"));
+    // Frame 7 was never there, and nobody asked for it at opening.
+    assert!(kitti.image(0, 2).unwrap_err().to_string().contains("0000000007.png"));
+}
+
+#[test]
+fn the_cache_keeps_what_its_cap_allows() {
+    let root = made_up(3..7);
+    let frame = 12 * 8 * 3;
+    let kitti = open(root.path(), None, Options { cache_bytes: 2 * frame + 1, ..Options::default() }).unwrap();
+    for offset in [-1, 0, 1] {
+        kitti.image(0, offset).unwrap();
+    }
+    let held = |cache: &Cache| (cache.pictures.len(), cache.bytes);
+    assert_eq!(held(&kitti.cache()), (2, 2 * frame));
+    assert!(Arc::ptr_eq(&kitti.image(0, 0).unwrap(), &kitti.image(1, -1).unwrap()));
+    assert!(!Arc::ptr_eq(&kitti.image(0, 1).unwrap(), &kitti.image(0, 1).unwrap()));
+}
+
+#[test]
+fn lines_that_point_nowhere_name_list_line_and_path() {
+    let root = made_up(3..7);
+    for (line, what) in [
+        ("day/other 5 l", "day/other"),
+        ("day/drive 9 l", "image_02/data/0000000009.png: the frame is missing"),
+        ("day/drive 3 l", "image_02/data/0000000002.png: the frame before frame 3 is missing"),
+        ("day/drive 6 r", "image_03/data/0000000007.png: the frame after frame 6 is missing"),
+        ("day/drive 5", "found 2 fields"),
+    ] {
+        let error = message(open(root.path(), Some(&format!("day/drive 4 l\n\n{line}\n")), Options::default()));
+        assert!(error.contains("split.txt: line 3: ") && error.contains(what), "{error}");
+    }
+    let first = made_up(0..3);
+    let error = message(open(first.path(), Some("day/drive 0 l"), Options::default()));
+    assert!(error.contains("split.txt: line 1: ") && error.contains("no previous frame"), "{error}");
+    assert!(open(first.path(), Some("day/drive 0 l"), TARGET_ONLY).is_ok());
+}
+
+#[test]
+fn what_cannot_be_used_is_found_at_opening() {
+    let root = made_up(3..7);
+    let neighbour = root.path().join("day/drive/image_02/data/0000000004.png");
+    fs::write(&neighbour, b"not a picture").unwrap();
+    for lines in [None, Some("day/drive 5 l\n")] {
+        let error = message(open(root.path(), lines, Options::default()));
+        assert!(error.contains("0000000004.png") && error.contains("could not decode"), "{error}");
+    }
+    for (root, what) in [(root.path().join("nowhere"), "nowhere"), (neighbour.clone(), "0000000004.png")] {
+        assert!(message(Kitti::open(&root, None, 8, 12, Options::default())).contains(what));
+    }
+    let empty = tempfile::tempdir().unwrap();
+    assert!(message(open(empty.path(), None, Options::default())).contains("no frames with both neighbours"));
+    assert!(message(open(root.path(), Some("\n\n"), Options::default())).contains("no samples"));
+    assert!(message(Kitti::open(root.path(), None, 0, 12, Options::default())).contains("height"));
+    let lidar = Options { ground_truth: GroundTruth::Lidar(DepthAxis::CameraZ), ..TARGET_ONLY };
+    assert!(message(open(root.path(), Some("day/drive 5 l"), lidar)).contains("calib_cam_to_cam.txt"));
+    let calibrated = Options { camera: Camera::Calibrated, ..TARGET_ONLY };
+    assert!(message(open(root.path(), Some("day/drive 5 l"), calibrated)).contains("calib_cam_to_cam.txt"));
+    let improved = Options { ground_truth: GroundTruth::Improved, ..TARGET_ONLY };
+    let error = message(open(root.path(), Some("day/drive 5 l"), improved));
+    assert!(error.contains("line 1") && error.contains("proj_depth/groundtruth/image_02/0000000005.png"), "{error}");
+}
+
+#[test]
+fn a_picture_that_is_cut_is_an_error_with_its_path() {
+    let root = made_up(3..7);
+    let path = root.path().join("day/drive/image_02/data/0000000005.png");
+    let picture =
+        RgbImage::from_fn(24, 16, |x, y| Rgb([(x * 31 ^ y * 17) as u8, (x * y * 7) as u8, (x + 9 * y) as u8]));
+    picture.save(&path).unwrap();
+    let bytes = fs::read(&path).unwrap();
+    fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+    let kitti = open(root.path(), Some("day/drive 5 l"), TARGET_ONLY).unwrap();
+    let error = kitti.image(0, 0).unwrap_err().to_string();
+    assert!(error.contains("0000000005.png") && error.contains("could not decode"), "{error}");
+}
+
+#[test]
+fn depth_files_are_found_by_camera() {
+    let root = made_up(3..7);
+    let depth = DepthMap { width: 3, height: 2, metres: vec![0.0, 1.5, 2.0, 80.0, 0.25, 10.0] };
+    let path = root.path().join("day/drive/proj_depth/groundtruth/image_03/0000000005.png");
+    write_depth_png(&path, &depth).unwrap();
+    let kitti = open(root.path(), Some("day/drive 5 l\nday/drive 5 r"), TARGET_ONLY).unwrap();
+    assert_eq!(kitti.depth(0).unwrap(), None);
+    assert_eq!(kitti.depth(1).unwrap(), Some(depth));
+    let improved = Options { ground_truth: GroundTruth::Improved, ..TARGET_ONLY };
+    assert_eq!(names(&open(root.path(), None, improved).unwrap()), ["day/drive 5 r"]);
+    let off = Options { ground_truth: GroundTruth::Off, ..TARGET_ONLY };
+    assert_eq!(open(root.path(), Some("day/drive 5 r"), off).unwrap().depth(0).unwrap(), None);
+}
+
+#[test]
+#[cfg_attr(not(kitti), ignore = "needs PARALLAX_KITTI, the folder of the real KITTI piece")]
+fn lidar_projects_to_the_reference_depths() {
+    let reference: serde_json::Value = serde_json::from_slice(&fixture_bytes("kitti_depth.json")).unwrap();
+    let root = kitti();
+    let lines = tempfile::tempdir().unwrap();
+    let lines =
+        split(lines.path(), "2011_09_26/2011_09_26_drive_0001_sync 5 l\n2011_09_26/2011_09_26_drive_0001_sync 5 r");
+    for (axis, kind) in [(DepthAxis::CameraZ, "camera_z"), (DepthAxis::LidarX, "lidar_x")] {
+        let options = Options { ground_truth: GroundTruth::Lidar(axis), ..TARGET_ONLY };
+        let kitti = Kitti::open(&root, Some(&lines), 96, 320, options).unwrap();
+        for (sample, camera) in [(0, "image_02"), (1, "image_03")] {
+            let expected = &reference["maps"][format!("{camera}/{kind}")];
+            let depth = kitti.depth(sample).unwrap().unwrap();
+            assert_eq!((depth.height, depth.width), (375, 1242));
+            let valid = depth.metres.iter().filter(|&&d| d > 0.0).count();
+            assert_eq!(valid as u64, expected["valid"].as_u64().unwrap(), "{camera}/{kind}");
+            let sum: f64 = depth.metres.iter().map(|&d| f64::from(d)).sum();
+            assert!((sum / expected["sum"].as_f64().unwrap() - 1.0).abs() < 1e-7, "{camera}/{kind} {sum}");
+            let samples = expected["samples"].as_array().unwrap();
+            assert_eq!(samples.len(), 60);
+            for s in samples {
+                let (row, column) = (s[0].as_u64().unwrap() as usize, s[1].as_u64().unwrap() as usize);
+                let found = f64::from(depth.metres[row * 1242 + column]);
+                assert!((found / s[2].as_f64().unwrap() - 1.0).abs() < 1e-6, "{camera}/{kind} {row} {column} {found}");
+            }
+        }
+    }
+}
+
+#[test]
+#[cfg_attr(not(kitti), ignore = "needs PARALLAX_KITTI, the folder of the real KITTI piece")]
+fn the_real_lists_open() {
+    let root = kitti();
+    let open = |list: &str, options| Kitti::open(&root, Some(&root.join("splits").join(list)), 96, 320, options);
+    let train = open("train_files.txt", Options { camera: Camera::Calibrated, ..Options::default() }).unwrap();
+    assert_eq!(train.len(), 54);
+    let camera = train.intrinsics(0);
+    assert!((camera.fx * 1242.0 - 721.5377).abs() < 1e-9 && (camera.cy * 375.0 - 172.854).abs() < 1e-9);
+    assert!(train.image(0, -1).unwrap() != train.image(0, 0).unwrap());
+    let improved = open("improved_files.txt", Options { ground_truth: GroundTruth::Improved, ..TARGET_ONLY }).unwrap();
+    let scan =
+        open("improved_files.txt", Options { ground_truth: GroundTruth::Lidar(DepthAxis::CameraZ), ..TARGET_ONLY });
+    let scan = scan.unwrap();
+    assert_eq!(
+        open("lidar_files.txt", Options { ground_truth: GroundTruth::Lidar(DepthAxis::LidarX), ..TARGET_ONLY })
+            .unwrap()
+            .len(),
+        7
+    );
+    // The improved ground truth is accumulated over frames and filtered; where both know a pixel or its neighbour,
+    // most of the depths agree.
+    let (improved, scan) = (improved.depth(0).unwrap().unwrap(), scan.depth(0).unwrap().unwrap());
+    let both: Vec<f32> = improved
+        .metres
+        .iter()
+        .zip(&scan.metres)
+        .filter(|(a, b)| **a > 0.0 && **b > 0.0)
+        .map(|(a, b)| (a / b - 1.0).abs())
+        .collect();
+    let close = both.iter().filter(|&&d| d < 0.05).count();
+    assert!(both.len() > 5000 && close * 10 > both.len() * 8, "{close} of {}", both.len());
+}
+
+#[test]
+#[cfg_attr(not(kitti), ignore = "needs PARALLAX_KITTI, the folder of the real KITTI piece")]
+fn without_a_list_the_real_piece_gives_its_triplets() {
+    let kitti = Kitti::open(&kitti(), None, 96, 320, Options::default()).unwrap();
+    // 44 of the drive with 46 frames, twice 5 of the one with 7.
+    assert_eq!(kitti.len(), 54);
+}

@@ -1,0 +1,74 @@
+//! Files appear whole or not at all: written aside, then renamed.
+
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use crate::{Error, Result};
+
+/// Writes a file through `write` so that nobody ever sees half of it: into a temporary file in the same folder,
+/// flushed to the disk, then renamed over `path`. If anything fails the temporary file is removed and what stood at
+/// `path` before still stands there. Missing parent folders are made.
+pub fn write_atomically(
+    path: impl AsRef<Path>,
+    write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
+) -> Result<()> {
+    static COUNTER: AtomicU64 = AtomicU64::new(0);
+    let path = path.as_ref();
+    let Some(name) = path.file_name() else {
+        return Err(Error::file(path, "expected the name of a file to write"));
+    };
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
+    let number = COUNTER.fetch_add(1, Ordering::Relaxed);
+    let aside = folder.join(format!(".{}.{}-{number}.tmp", name.to_string_lossy(), std::process::id()));
+    let result = write_whole(&aside, write).and_then(|()| fs::rename(&aside, path));
+    if result.is_err() {
+        // The first error is the one to report; a temporary file that cannot be removed adds nothing to it.
+        let _ = fs::remove_file(&aside);
+    }
+    result.map_err(|e| Error::io(path, e))
+}
+
+fn write_whole(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>) -> io::Result<()> {
+    let mut writer = BufWriter::new(File::create(path)?);
+    write(&mut writer)?;
+    writer.flush()?;
+    writer.get_ref().sync_all()
+}
+
+/// [`write_atomically`] for bytes that are at hand.
+pub fn write_bytes_atomically(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
+    write_atomically(path, |writer| writer.write_all(bytes))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn writes_replaces_and_makes_folders() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a/b/file.txt");
+        write_bytes_atomically(&path, b"one").unwrap();
+        write_bytes_atomically(&path, b"two").unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"two");
+        assert_eq!(fs::read_dir(path.parent().unwrap()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_failed_write_leaves_the_old_file_and_no_litter() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("file.txt");
+        write_bytes_atomically(&path, b"old").unwrap();
+        let error = write_atomically(&path, |writer| {
+            writer.write_all(b"half of the new")?;
+            Err(io::Error::other("the disk is full"))
+        })
+        .unwrap_err();
+        assert!(error.to_string().contains("file.txt") && error.to_string().contains("the disk is full"), "{error}");
+        assert_eq!(fs::read(&path).unwrap(), b"old");
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+}
