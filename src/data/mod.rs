@@ -69,3 +69,34 @@ pub trait Dataset: Send + Sync {
     /// Ground-truth depth of the target frame at its own size, where there is one.
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>>;
 }
+
+/// Some samples of a data set.
+pub struct Subset {
+    data: Arc<dyn Dataset>,
+    samples: Vec<usize>,
+}
+
+impl Subset {
+    /// Those with the given indices.
+    pub fn new(data: Arc<dyn Dataset>, samples: Vec<usize>) -> Self {
+        Subset { data, samples }
+    }
+}
+
+impl Dataset for Subset {
+    fn len(&self) -> usize {
+        self.samples.len()
+    }
+    fn name(&self, sample: usize) -> String {
+        self.data.name(self.samples[sample])
+    }
+    fn image(&self, sample: usize, offset: i32) -> Result<Arc<RgbImage>> {
+        self.data.image(self.samples[sample], offset)
+    }
+    fn intrinsics(&self, sample: usize) -> Intrinsics {
+        self.data.intrinsics(self.samples[sample])
+    }
+    fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {
+        self.data.depth(self.samples[sample])
+    }
+}

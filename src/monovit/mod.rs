@@ -3,10 +3,12 @@
 pub mod config;
 pub mod decoder;
 pub mod encoder;
+pub mod evaluation;
 pub mod loss;
 pub mod metrics;
 mod model;
 pub mod pose;
+pub mod run;
 pub mod trainer;
 
 pub use config::{Config, Preset};

@@ -1,0 +1,76 @@
+//! `parallax data`.
+
+use std::path::PathBuf;
+
+use parallax::data::street::{Street, StreetConfig, export};
+use parallax::{Error, Result};
+
+use super::progress::Progress;
+
+#[derive(clap::Args)]
+pub struct Args {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(clap::Subcommand)]
+enum What {
+    /// The embedded street, in the layout of KITTI raw, with exact depth and poses.
+    Street(StreetArgs),
+}
+
+#[derive(clap::Args)]
+struct StreetArgs {
+    /// A new or empty folder.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// How many sequences.
+    #[arg(long, default_value_t = 4)]
+    sequences: usize,
+    /// Frames of each.
+    #[arg(long, default_value_t = 24)]
+    frames: usize,
+    /// Height of the pictures.
+    #[arg(long, default_value_t = 96)]
+    height: usize,
+    /// Width of the pictures.
+    #[arg(long, default_value_t = 320)]
+    width: usize,
+    /// Everything random follows from this number.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Let other cars drive too.
+    #[arg(long)]
+    moving_cars: bool,
+}
+
+pub fn run(args: Args) -> Result<()> {
+    let What::Street(a) = args.what;
+    for (name, value) in [("--sequences", a.sequences), ("--frames", a.frames), ("--height", a.height), ("--width", a.width)] {
+        if value == 0 || value > 20_000 {
+            return Err(Error::setting(name, format!("{value} is not from 1 to 20000")));
+        }
+    }
+    let config = StreetConfig {
+        height: a.height,
+        width: a.width,
+        sequences: a.sequences,
+        frames: a.frames,
+        seed: a.seed,
+        moving_cars: a.moving_cars,
+        ..StreetConfig::default()
+    };
+    let progress = std::sync::Mutex::new(Progress::new("frames", (a.sequences * a.frames) as u64));
+    let report = |done: usize, _: usize| {
+        if let Ok(mut progress) = progress.lock() {
+            progress.set(done as u64, "");
+        }
+    };
+    let street = Street::render(&config, Some(&report));
+    export::write(&street, &a.out)?;
+    if let Ok(progress) = progress.lock() {
+        progress.finish();
+    }
+    eprintln!("wrote {} sequences of {} frames to {}", a.sequences, a.frames, a.out.display());
+    Ok(())
+}

@@ -1,0 +1,86 @@
+//! `parallax info`.
+
+use parallax::Result;
+use parallax::monovit::run::check_size;
+use parallax::monovit::{MonoVit, Preset};
+use parallax::nn::Context;
+use parallax::ops::trace;
+use parallax::tensor::{Tensor, Var};
+use serde::Serialize;
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// The size of the networks.
+    #[arg(long, default_value = "nano")]
+    preset: Preset,
+    /// Height of the pictures.
+    #[arg(long, default_value_t = 96)]
+    height: usize,
+    /// Width of the pictures.
+    #[arg(long, default_value_t = 320)]
+    width: usize,
+    /// Pictures at a time.
+    #[arg(long, default_value_t = 4)]
+    batch: usize,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Serialize)]
+struct Parameters {
+    encoder: usize,
+    depth: usize,
+    pose_encoder: usize,
+    pose: usize,
+}
+
+#[derive(Serialize)]
+struct Info {
+    parameters: Parameters,
+    gflop_inference: f64,
+    gflop_step: f64,
+    memory_bytes: u64,
+}
+
+pub fn run(args: Args) -> Result<()> {
+    check_size("--height", args.height)?;
+    check_size("--width", args.width)?;
+    let (model, params) = MonoVit::new::<f32>(args.preset.config(), 0);
+    // Counted by running one picture: the arithmetic of an op is said by the op itself.
+    let c = Context::inference(&params);
+    let image = Var::constant(Tensor::zeros([1, args.height, args.width, 3]));
+    let (_, depth) = trace::record(false, || model.disparities(&c, &image));
+    let (_, pose) = trace::record(false, || model.transforms(&c, &image, &image, &image));
+    let count = |entries: &[trace::Entry]| entries.iter().map(|e| e.flops).sum::<u64>() as f64 * 1e-9;
+    let outputs: usize = depth.iter().chain(&pose).map(|e| e.output.len()).sum();
+    let part = |prefix: &str| params.count(prefix);
+    let batch = args.batch as f64;
+    let parameters = Parameters {
+        encoder: part("encoder."),
+        depth: part("depth."),
+        pose_encoder: part("pose_encoder."),
+        pose: part("pose."),
+    };
+    let learnt: usize = params.count("");
+    let info = Info {
+        gflop_inference: batch * count(&depth),
+        gflop_step: batch * 3.0 * (count(&depth) + count(&pose)),
+        // Weights, two moments, gradients, the average; and every op's output, kept for the backward pass.
+        memory_bytes: 4 * (5 * learnt + args.batch * outputs) as u64,
+        parameters,
+    };
+    if args.json {
+        return super::print_json(&info);
+    }
+    let p = &info.parameters;
+    println!("{} at {}x{}, batch {}", args.preset.name(), args.width, args.height, args.batch);
+    for (name, n) in [("encoder", p.encoder), ("depth", p.depth), ("pose encoder", p.pose_encoder), ("pose", p.pose)] {
+        println!("{name:14} {n:>12} parameters");
+    }
+    println!("{:14} {learnt:>12} parameters", "together");
+    println!("{:14} {:>12.2} GFLOP", "inference", info.gflop_inference);
+    println!("{:14} {:>12.2} GFLOP", "training step", info.gflop_step);
+    println!("{:14} {:>12.0} MiB (estimate)", "training step", info.memory_bytes as f64 / f64::from(1 << 20));
+    Ok(())
+}

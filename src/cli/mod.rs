@@ -1,0 +1,83 @@
+//! The command line: arguments in, library calls, tables and JSON out. Exit status 0 done, 1 failed, 2 wrong usage.
+
+mod bench;
+mod data;
+mod eval;
+mod gradcheck;
+mod info;
+mod predict;
+mod progress;
+mod train;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+use parallax::{Error, Result};
+
+/// Monocular depth without supervision, from scratch on the CPU: train MonoViT, predict depth, check every gradient.
+#[derive(Parser)]
+#[command(name = "parallax", version, about, max_term_width = 100)]
+struct Cli {
+    /// Threads to compute on; all processors unless given.
+    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    threads: Option<u16>,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Train; with no flags: the reduced network on the embedded street.
+    Train(train::Args),
+    /// Measure weights against ground-truth depth: the seven metrics.
+    Eval(eval::Args),
+    /// Turn pictures into depth maps.
+    Predict(predict::Args),
+    /// Check every op's gradient against finite differences, now, on this machine.
+    Gradcheck(gradcheck::Args),
+    /// Time a training step or an inference, op by op.
+    Bench(bench::Args),
+    /// Count parameters, arithmetic and memory before you start.
+    Info(info::Args),
+    /// Write the embedded street as files.
+    Data(data::Args),
+}
+
+/// Runs the program.
+pub fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let result = start_threads(cli.threads).and_then(|()| match cli.command {
+        Command::Train(args) => train::run(args),
+        Command::Eval(args) => eval::run(args),
+        Command::Predict(args) => predict::run(args),
+        Command::Gradcheck(args) => gradcheck::run(args),
+        Command::Bench(args) => bench::run(args),
+        Command::Info(args) => info::run(args),
+        Command::Data(args) => data::run(args),
+    });
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("parallax: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// The pool that kernels run in, with this thread as one of its workers: handing work over from outside a pool costs a
+/// thousand times more.
+fn start_threads(threads: Option<u16>) -> Result<()> {
+    let available = std::thread::available_parallelism().map_or(1, usize::from);
+    rayon::ThreadPoolBuilder::new()
+        .num_threads(threads.map_or(available, usize::from))
+        .use_current_thread()
+        .build_global()
+        .map_err(|e| Error::setting("--threads", format!("the threads could not be started: {e}")))
+}
+
+/// Prints a value as one line of JSON on standard output.
+fn print_json(value: &impl serde::Serialize) -> Result<()> {
+    let text = serde_json::to_string(value).map_err(|e| Error::Failed(format!("the result as JSON: {e}")))?;
+    println!("{text}");
+    Ok(())
+}

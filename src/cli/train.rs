@@ -1,0 +1,239 @@
+//! `parallax train`.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use parallax::data::Dataset;
+use parallax::data::kitti::{Kitti, Options};
+use parallax::data::street::{Street, StreetConfig};
+use parallax::monovit::Preset;
+use parallax::monovit::metrics::Metrics;
+use parallax::monovit::run::{Ended, Event, Run, RunConfig, RunData, RunMetrics, read_config};
+use parallax::optim::Decay;
+use parallax::{Error, Result};
+
+use super::progress::Progress;
+
+/// Steps of the default run.
+const STEPS: u64 = 2000;
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// Where frames come from: `street` (made by the program) or a folder in the layout of KITTI raw.
+    #[arg(long, value_name = "street|DIR")]
+    data: Option<String>,
+    /// The frames of a folder to train on: lines `FOLDER FRAME SIDE`. All that have neighbours, without.
+    #[arg(long, value_name = "FILE")]
+    split: Option<PathBuf>,
+    /// The frames of a folder to validate on. Every tenth training frame is set aside, without.
+    #[arg(long, value_name = "FILE")]
+    val_split: Option<PathBuf>,
+    /// The size of the networks.
+    #[arg(long)]
+    preset: Option<Preset>,
+    /// Height of the pictures that the networks see, a multiple of 32.
+    #[arg(long, value_name = "PIXELS")]
+    height: Option<usize>,
+    /// Width of the pictures that the networks see, a multiple of 32.
+    #[arg(long, value_name = "PIXELS")]
+    width: Option<usize>,
+    /// Samples a step.
+    #[arg(long, value_name = "N")]
+    batch: Option<usize>,
+    /// How many steps.
+    #[arg(long, value_name = "N", conflicts_with = "epochs")]
+    steps: Option<u64>,
+    /// How many times through the data, instead of steps.
+    #[arg(long, value_name = "N")]
+    epochs: Option<u64>,
+    /// The learning rate of everything.
+    #[arg(long, value_name = "RATE")]
+    learning_rate: Option<f64>,
+    /// Everything random follows from this number.
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+    /// A configuration such as a run's config.toml; flags win over it.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Weights to start from.
+    #[arg(long, value_name = "WEIGHTS")]
+    init: Option<PathBuf>,
+    /// Go on with an interrupted run.
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "config", "init", "data", "split", "preset"])]
+    resume: Option<PathBuf>,
+    /// The run's folder, new or empty.
+    #[arg(long, value_name = "RUN")]
+    out: Option<PathBuf>,
+    /// Print `metrics.json` on standard output at the end, and nothing else there.
+    #[arg(long)]
+    json: bool,
+}
+
+pub fn run(args: Args) -> Result<()> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let asked = stop.clone();
+    ctrlc::set_handler(move || {
+        // The second time, at once.
+        if asked.swap(true, Ordering::SeqCst) {
+            std::process::exit(130);
+        }
+        eprintln!("\nstopping after this step; once more to stop at once");
+    })
+    .map_err(|e| Error::Failed(format!("Ctrl-C cannot be caught: {e}")))?;
+
+    let (mut run, data) = match &args.resume {
+        Some(folder) => {
+            let run = Run::resume(folder)?;
+            let data = open(&run.config)?;
+            (run, data)
+        }
+        None => {
+            let mut config = configuration(&args)?;
+            config.check()?;
+            let folder = args.out.clone().unwrap_or_else(|| next_free("runs"));
+            let data = open(&config)?;
+            if let Some(epochs) = args.epochs {
+                set_steps(&mut config, epochs * data.train.len().div_ceil(config.batch.max(1)) as u64);
+            }
+            enough(&data, &config)?;
+            (Run::create(&folder, config)?, data)
+        }
+    };
+    eprintln!("training {} on {} samples, {} steps of {}; everything goes to {}", run.config.preset.name(), data.train.len(), run.config.steps, run.config.batch, run.folder.display());
+    let mut progress = Progress::new("training", run.config.steps);
+    let ended = run.train(&data, || stop.load(Ordering::SeqCst), |event| match event {
+        Event::Phase(what) => progress.say(what),
+        Event::Step(r) => {
+            let note = format!("loss {:.4} photometric {:.4} (unwarped {:.4})", r.loss, r.photometric, r.unwarped);
+            progress.set(r.step, &note);
+        }
+        Event::Validated(step, error, best) => {
+            let best = if best { ", the best so far" } else { "" };
+            progress.say(&format!("step {step}: photometric error on validation data {error:.4}{best}"));
+        }
+    })?;
+    progress.finish();
+    let folder = run.folder.display();
+    match ended {
+        Ended::Interrupted(step) => {
+            eprintln!("stopped after step {step}; go on with: parallax train --resume {folder}");
+        }
+        Ended::Finished(None) => {
+            eprintln!("done; the data has no ground-truth depth to measure against. Look at {folder}/images");
+        }
+        Ended::Finished(Some(metrics)) => {
+            if args.json {
+                super::print_json(&metrics)?;
+            }
+            print_metrics(&metrics);
+            eprintln!("done in {:.0} s; look at {folder}/images", metrics.seconds);
+        }
+    }
+    Ok(())
+}
+
+fn print_metrics(m: &RunMetrics) {
+    eprintln!("\n{} images that nothing was chosen on ({})", m.images, m.test);
+    eprintln!("{:14} {:>8} {:>8} {:>8} {:>9} {:>6} {:>6} {:>6}", "", "Abs Rel", "Sq Rel", "RMSE", "RMSE log", "a1", "a2", "a3");
+    let row = |name: &str, m: &Metrics| {
+        eprintln!(
+            "{name:14} {:8.4} {:8.4} {:8.3} {:9.4} {:6.3} {:6.3} {:6.3}",
+            m.abs_rel, m.sq_rel, m.rmse, m.rmse_log, m.a1, m.a2, m.a3
+        );
+    };
+    row("untrained", &m.before);
+    row("mean depth map", &m.mean_map);
+    row("trained", &m.after);
+}
+
+fn configuration(args: &Args) -> Result<RunConfig> {
+    let mut c = match &args.config {
+        Some(path) => read_config(path)?,
+        None => RunConfig::new(args.preset.unwrap_or(Preset::Nano), STEPS),
+    };
+    macro_rules! take {
+        ($($field:ident),*) => {$(if let Some(value) = args.$field.clone() { c.$field = value; })*};
+    }
+    take!(data, preset, height, width, batch, seed);
+    for (to, from) in [(&mut c.split, &args.split), (&mut c.val_split, &args.val_split), (&mut c.init, &args.init)] {
+        if from.is_some() {
+            *to = from.clone();
+        }
+    }
+    if let Some(rate) = args.learning_rate {
+        if !(rate > 0.0 && rate.is_finite()) {
+            return Err(Error::setting("--learning-rate", format!("{rate} is not a number above 0")));
+        }
+        (c.optim.encoder_rate, c.optim.rate) = (rate, rate);
+    }
+    if let Some(steps) = args.steps {
+        set_steps(&mut c, steps);
+    }
+    Ok(c)
+}
+
+/// Sets the number of steps; a cosine ends with them.
+fn set_steps(config: &mut RunConfig, count: u64) {
+    config.steps = count;
+    if let Decay::Cosine { steps, .. } = &mut config.optim.schedule.decay {
+        *steps = count;
+    }
+}
+
+/// `runs/1`, `runs/2`, ...: the first that is not there.
+fn next_free(parent: &str) -> PathBuf {
+    (1..).map(|i| Path::new(parent).join(i.to_string())).find(|p| !p.exists()).expect("numbers do not end")
+}
+
+fn enough(data: &RunData, config: &RunConfig) -> Result<()> {
+    if data.train.len() < config.batch {
+        let message = format!("{} samples a batch, but the data holds {}: make it smaller", config.batch, data.train.len());
+        return Err(Error::setting("--batch", message));
+    }
+    Ok(())
+}
+
+/// Opens what a run trains, validates and reports on.
+fn open(config: &RunConfig) -> Result<RunData> {
+    let (height, width) = (config.height, config.width);
+    if config.data == "street" {
+        let street = |what: &'static str, seed: u64, sequences: usize| {
+            let settings = StreetConfig { height, width, sequences, seed, ..StreetConfig::default() };
+            let progress = std::sync::Mutex::new(Progress::new(what, (sequences * settings.frames) as u64));
+            let report = |done: usize, _: usize| {
+                if let Ok(mut progress) = progress.lock() {
+                    progress.set(done as u64, "");
+                }
+            };
+            let street = Street::render(&settings, Some(&report));
+            if let Ok(progress) = progress.lock() {
+                progress.finish();
+            }
+            Arc::new(street)
+        };
+        // Seeds far apart: three worlds that have no street in common.
+        let seed = config.seed;
+        return Ok(RunData {
+            train: street("street", seed, 40),
+            validation: street("validation", seed + 1_000_000, 4),
+            test: Some(street("test", seed + 2_000_000, 8)),
+        });
+    }
+    let root = Path::new(&config.data);
+    let all: Arc<dyn Dataset> = Arc::new(Kitti::open(root, config.split.as_deref(), height, width, Options::default())?);
+    Ok(match &config.val_split {
+        Some(split) => {
+            let validation = Arc::new(Kitti::open(root, Some(split), height, width, Options::default())?);
+            RunData { train: all, validation, test: None }
+        }
+        None => {
+            let (aside, rest) = (0..all.len()).partition(|i| i % 10 == 9);
+            RunData {
+                train: Arc::new(parallax::data::Subset::new(all.clone(), rest)),
+                validation: Arc::new(parallax::data::Subset::new(all, aside)),
+                test: None,
+            }
+        }
+    })
+}

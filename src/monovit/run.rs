@@ -1,0 +1,423 @@
+//! A training run: its configuration, its folder, and the loop that fills it.
+//!
+//! `RUN/config.toml` (all of it, to run it again), `log.jsonl` (a line a logged step), `checkpoints/` (the whole state),
+//! `best.safetensors`, `metrics.json`, `images/`.
+
+use std::collections::HashMap;
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+
+use serde::{Deserialize, Serialize};
+
+use super::config::{Config, Preset};
+use super::evaluation::{Evaluation, Predictor, evaluate, evaluate_mean_map};
+use super::loss::LossConfig;
+use super::metrics::{MeanMap, Metrics, Protocol, Scale};
+use super::model::MonoVit;
+use super::trainer::{OptimConfig, StepReport, Trainer};
+use crate::data::Dataset;
+use crate::data::batch::{Augment, Batch, Loader, batch_of_step};
+use crate::error::{Error, Result};
+use crate::files::write_bytes_atomically;
+use crate::nn::{Params, checkpoint};
+use crate::optim::{Decay, Schedule};
+use crate::report::colormap::disparity_to_image;
+
+/// Everything that decides a run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunConfig {
+    /// The named sizes.
+    pub preset: Preset,
+    /// Height of the pictures that the networks see, a multiple of 32.
+    pub height: usize,
+    /// Width of the pictures that the networks see, a multiple of 32.
+    pub width: usize,
+    /// Samples a step.
+    pub batch: usize,
+    /// Steps.
+    pub steps: u64,
+    /// Everything random follows from it.
+    pub seed: u64,
+    /// `street`, or a folder in the layout of KITTI raw.
+    pub data: String,
+    /// A split list for training; all frames without.
+    pub split: Option<PathBuf>,
+    /// A split list for validation and the final metrics of a folder.
+    pub val_split: Option<PathBuf>,
+    /// Weights to start from.
+    pub init: Option<PathBuf>,
+    /// A line in the log every so many steps.
+    pub log_every: u64,
+    /// The whole state is written, and the weights are validated, every so many steps.
+    pub checkpoint_every: u64,
+    /// Augmentation.
+    pub augment: Augment,
+    /// The loss.
+    pub loss: LossConfig,
+    /// The optimiser.
+    pub optim: OptimConfig,
+}
+
+impl RunConfig {
+    /// The recipe for a small network from scratch, on the embedded street.
+    pub fn new(preset: Preset, steps: u64) -> Self {
+        RunConfig {
+            preset,
+            height: 96,
+            width: 320,
+            batch: 4,
+            steps,
+            seed: 0,
+            data: "street".into(),
+            split: None,
+            val_split: None,
+            init: None,
+            log_every: 10,
+            checkpoint_every: 250,
+            augment: Augment { flip: true, jitter: false },
+            loss: LossConfig::default(),
+            optim: OptimConfig {
+                encoder_rate: 6e-4,
+                rate: 6e-4,
+                decay: 0.01,
+                betas: [0.9, 0.999],
+                clip: 0.0,
+                average: 0.99,
+                schedule: Schedule { warm_up: 100, decay: Decay::Cosine { steps, end: 0.01 } },
+            },
+        }
+    }
+
+    /// The sizes of the networks.
+    pub fn model(&self) -> Config {
+        self.preset.config()
+    }
+
+    /// Checks what can be checked without data.
+    pub fn check(&self) -> Result<()> {
+        check_size("--height", self.height)?;
+        check_size("--width", self.width)?;
+        if self.batch == 0 {
+            return Err(Error::setting("--batch", "at least 1"));
+        }
+        if self.steps == 0 {
+            return Err(Error::setting("--steps", "at least 1"));
+        }
+        Ok(())
+    }
+}
+
+/// Sides of pictures are multiples of 32, because the deepest map has a 32nd of them.
+pub fn check_size(name: &str, size: usize) -> Result<()> {
+    if size == 0 || !size.is_multiple_of(32) || size > 8192 {
+        let below = (size / 32 * 32).clamp(32, 8192);
+        let message = format!("{size} is not a multiple of 32 from 32 to 8192; {below} would do");
+        return Err(Error::setting(name, message));
+    }
+    Ok(())
+}
+
+/// What a run trains, validates and reports on. No sample is in two of them.
+pub struct RunData {
+    /// Trained on.
+    pub train: Arc<dyn Dataset>,
+    /// The photometric loss on these selects the best weights.
+    pub validation: Arc<dyn Dataset>,
+    /// `metrics.json` reports on these, where there is ground truth.
+    pub test: Option<Arc<dyn Dataset>>,
+}
+
+/// `metrics.json`.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct RunMetrics {
+    /// The weights as they start.
+    pub before: Metrics,
+    /// The best weights.
+    pub after: Metrics,
+    /// The mean depth map of the training data.
+    pub mean_map: Metrics,
+    /// The time of the training loop, in seconds.
+    pub seconds: f64,
+    /// Its steps.
+    pub steps: u64,
+    /// How many images were compared.
+    pub images: usize,
+    /// What was compared, in words.
+    pub test: String,
+}
+
+/// A logged step.
+#[derive(Clone, Debug, Serialize)]
+struct LogLine {
+    #[serde(flatten)]
+    step: StepReport,
+    /// Of one step, the mean since the last line.
+    seconds: f64,
+    /// Waiting for data, of one step.
+    data_seconds: f64,
+}
+
+/// What the loop tells whoever watches.
+pub enum Event<'a> {
+    /// A phase begins, in words.
+    Phase(&'a str),
+    /// A step is done.
+    Step(&'a StepReport),
+    /// Weights were validated: step, photometric error, whether they are the best so far.
+    Validated(u64, f64, bool),
+}
+
+/// How a run ended.
+pub enum Ended {
+    /// All steps are done.
+    Finished(Option<RunMetrics>),
+    /// Someone asked it to stop; it can be resumed.
+    Interrupted(u64),
+}
+
+/// A run's folder.
+pub struct Run {
+    /// The folder.
+    pub folder: PathBuf,
+    /// What it runs.
+    pub config: RunConfig,
+    trainer: Trainer,
+    /// The photometric error of the best weights so far.
+    best: f64,
+    /// Seconds of training before this process.
+    seconds: f64,
+    before: Option<Metrics>,
+}
+
+/// What a state file says beside the tensors.
+#[derive(Serialize, Deserialize)]
+struct StateNotes {
+    best: f64,
+    seconds: f64,
+    before: Option<Metrics>,
+}
+
+impl Run {
+    /// A new run in an empty or missing folder.
+    pub fn create(folder: &Path, config: RunConfig) -> Result<Self> {
+        config.check()?;
+        if fs::read_dir(folder).is_ok_and(|mut entries| entries.next().is_some()) {
+            let message = "is not empty: give another folder with --out, or go on with --resume";
+            return Err(Error::file(folder, message));
+        }
+        fs::create_dir_all(folder.join("checkpoints")).map_err(|e| Error::io(folder, e))?;
+        let text = toml::to_string(&config).map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
+        write_bytes_atomically(folder.join("config.toml"), text.as_bytes())?;
+        let mut run = Self::at(folder, config);
+        if let Some(init) = run.config.init.clone() {
+            let contents = checkpoint::read(&init)?;
+            checkpoint::import(&mut run.trainer.params, &contents.tensors, &init)?;
+        }
+        Ok(run)
+    }
+
+    /// A run that was interrupted, where it stood.
+    pub fn resume(folder: &Path) -> Result<Self> {
+        let config = read_config(&folder.join("config.toml"))?;
+        let mut run = Self::at(folder, config);
+        let state = run.state_file();
+        run.trainer.load(&state)?;
+        let notes = checkpoint::read::<f32>(&state)?.metadata.remove("run").unwrap_or_default();
+        let notes: StateNotes =
+            serde_json::from_str(&notes).map_err(|e| Error::file(&state, format!("its notes on the run: {e}")))?;
+        (run.best, run.seconds, run.before) = (notes.best, notes.seconds, notes.before);
+        // Lines that were logged after the state was written will be logged again.
+        let log = folder.join("log.jsonl");
+        if let Ok(text) = fs::read_to_string(&log) {
+            let done = run.trainer.steps();
+            let step = |line: &&str| {
+                serde_json::from_str::<serde_json::Value>(line).ok().and_then(|v| v["step"].as_u64())
+            };
+            let kept: String =
+                text.lines().filter(|l| step(l).is_some_and(|s| s <= done)).flat_map(|l| [l, "\n"]).collect();
+            write_bytes_atomically(&log, kept.as_bytes())?;
+        }
+        Ok(run)
+    }
+
+    fn at(folder: &Path, config: RunConfig) -> Self {
+        let trainer = Trainer::new(config.model(), config.optim, config.loss, config.seed);
+        Run { folder: folder.to_owned(), config, trainer, best: f64::INFINITY, seconds: 0.0, before: None }
+    }
+
+    fn state_file(&self) -> PathBuf {
+        self.folder.join("checkpoints/state.safetensors")
+    }
+
+    /// Steps done.
+    pub fn steps(&self) -> u64 {
+        self.trainer.steps()
+    }
+
+    /// Trains to the end, or until `stop` says so.
+    pub fn train(&mut self, data: &RunData, stop: impl Fn() -> bool, mut tell: impl FnMut(Event)) -> Result<Ended> {
+        let how = Evaluation { protocol: Protocol::Dense, scale: Scale::Median, flip: false };
+        let test: Option<(&dyn Dataset, Vec<usize>)> =
+            data.test.as_deref().map(|t| (t, (0..t.len()).collect::<Vec<_>>()));
+        if let (Some((test, samples)), None) = (&test, self.before) {
+            tell(Event::Phase("measuring the untrained network"));
+            let predictor = Predictor::new(&self.trainer.model, &self.trainer.params, &self.config.loss);
+            self.before = Some(evaluate(&predictor, *test, samples, how, |_| ())?.metrics);
+        }
+        let validation = self.validation_batches(data)?;
+        let (augment, batch, seed) = (self.config.augment, self.config.batch, self.config.seed);
+        let mut loader = Loader::start(data.train.clone(), augment, batch, seed, self.trainer.steps())?;
+        let log_path = self.folder.join("log.jsonl");
+        let log = fs::OpenOptions::new().create(true).append(true).open(&log_path);
+        let mut log = log.map_err(|e| Error::io(&log_path, e))?;
+
+        tell(Event::Phase("training"));
+        let (mut since, mut waited, mut counted) = (Instant::now(), 0.0, 0u32);
+        while self.trainer.steps() < self.config.steps {
+            let asked = Instant::now();
+            let batch = loader.next_batch()?;
+            waited += asked.elapsed().as_secs_f64();
+            let report = self.trainer.step(&batch)?;
+            counted += 1;
+            let last = report.step == self.config.steps;
+            if report.step.is_multiple_of(self.config.log_every) || last || report.step == 1 {
+                let n = f64::from(counted);
+                let line =
+                    LogLine { step: report, seconds: since.elapsed().as_secs_f64() / n, data_seconds: waited / n };
+                let text = serde_json::to_string(&line).map_err(|e| Error::Failed(format!("the log: {e}")))?;
+                writeln!(log, "{text}").map_err(|e| Error::io(&log_path, e))?;
+                self.seconds += since.elapsed().as_secs_f64();
+                (since, waited, counted) = (Instant::now(), 0.0, 0);
+            }
+            tell(Event::Step(&report));
+            let stopping = stop() && !last;
+            if report.step.is_multiple_of(self.config.checkpoint_every) || last || stopping {
+                self.seconds += since.elapsed().as_secs_f64();
+                if !stopping {
+                    self.keep_if_best(&validation, report.step, &mut tell)?;
+                }
+                self.save()?;
+                since = Instant::now();
+            }
+            if stopping {
+                return Ok(Ended::Interrupted(report.step));
+            }
+        }
+        drop(loader);
+        self.finish(data, test, how, &mut tell).map(Ended::Finished)
+    }
+
+    /// A fixed set of batches without augmentation.
+    fn validation_batches(&self, data: &RunData) -> Result<Vec<Batch>> {
+        let plain = Augment { flip: false, jitter: false };
+        let size = self.config.batch.min(data.validation.len());
+        let count = (data.validation.len() / size.max(1)).min(10) as u64;
+        (0..count).map(|step| batch_of_step(data.validation.as_ref(), plain, size, 0, step)).collect()
+    }
+
+    fn keep_if_best(&mut self, validation: &[Batch], step: u64, tell: &mut impl FnMut(Event)) -> Result<()> {
+        let weights = self.trainer.weights();
+        let error = self.trainer.validate(&weights, validation);
+        let better = error < self.best;
+        if better {
+            self.best = error;
+            write_weights(&self.folder.join("best.safetensors"), &weights, &self.config)?;
+        }
+        tell(Event::Validated(step, error, better));
+        Ok(())
+    }
+
+    fn save(&self) -> Result<()> {
+        let notes = StateNotes { best: self.best, seconds: self.seconds, before: self.before };
+        let notes = serde_json::to_string(&notes).map_err(|e| Error::Failed(format!("the state: {e}")))?;
+        self.trainer.save(&self.state_file(), HashMap::from([("run".into(), notes)]))
+    }
+
+    fn finish(
+        &self,
+        data: &RunData,
+        test: Option<(&dyn Dataset, Vec<usize>)>,
+        how: Evaluation,
+        tell: &mut impl FnMut(Event),
+    ) -> Result<Option<RunMetrics>> {
+        tell(Event::Phase("measuring the best weights"));
+        let (model, params, _) = load_weights(&self.folder.join("best.safetensors"))?;
+        let predictor = Predictor::new(&model, &params, &self.config.loss);
+        let shown: &dyn Dataset = test.as_ref().map_or(data.validation.as_ref(), |(t, _)| *t);
+        self.write_images(&predictor, shown)?;
+        let Some((test, samples)) = test else { return Ok(None) };
+        let after = evaluate(&predictor, test, &samples, how, |_| ())?;
+        let map = MeanMap::of_dataset(data.train.as_ref())?;
+        let metrics = RunMetrics {
+            before: self.before.unwrap_or_default(),
+            after: after.metrics,
+            mean_map: evaluate_mean_map(&map, test, &samples, how)?.metrics,
+            seconds: self.seconds,
+            steps: self.trainer.steps(),
+            images: after.images,
+            test: format!("{} and {} more", test.name(0), samples.len() - 1),
+        };
+        let text = serde_json::to_string_pretty(&metrics).map_err(|e| Error::Failed(format!("the metrics: {e}")))?;
+        write_bytes_atomically(self.folder.join("metrics.json"), text.as_bytes())?;
+        Ok(Some(metrics))
+    }
+
+    /// A few pictures with their predicted disparity (and the true one, where it is known) below.
+    fn write_images(&self, predictor: &Predictor, data: &dyn Dataset) -> Result<()> {
+        let count = data.len().min(8);
+        for i in 0..count {
+            let sample = i * data.len() / count;
+            let image = data.image(sample, 0)?;
+            let (w, h) = image.dimensions();
+            let mut rows =
+                vec![image.as_ref().clone(), disparity_to_image(&predictor.disparity(&image), w as usize, h as usize)];
+            if let Some(truth) = data.depth(sample)?
+                && (truth.width, truth.height) == (w as usize, h as usize)
+            {
+                let inverse: Vec<f32> = truth.metres.iter().map(|&m| if m > 0.0 { 1.0 / m } else { 0.0 }).collect();
+                rows.push(disparity_to_image(&inverse, truth.width, truth.height));
+            }
+            let mut sheet = image::RgbImage::new(w, h * rows.len() as u32);
+            for (r, row) in rows.iter().enumerate() {
+                image::imageops::replace(&mut sheet, row, 0, i64::from(h) * r as i64);
+            }
+            let path = self.folder.join(format!("images/{i:02}.png"));
+            let mut bytes = std::io::Cursor::new(Vec::new());
+            sheet
+                .write_to(&mut bytes, image::ImageFormat::Png)
+                .map_err(|e| Error::file(&path, format!("could not be encoded: {e}")))?;
+            write_bytes_atomically(&path, bytes.get_ref())?;
+        }
+        Ok(())
+    }
+}
+
+/// Reads a run's (or anybody's) configuration.
+pub fn read_config(path: &Path) -> Result<RunConfig> {
+    let text = fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+    toml::from_str(&text).map_err(|e| Error::file(path, e.to_string()))
+}
+
+/// Writes weights for use: PyTorch's names and layouts, the configuration in the metadata.
+pub fn write_weights(path: &Path, params: &Params<f32>, config: &RunConfig) -> Result<()> {
+    let text = serde_json::to_string(config).map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
+    checkpoint::write(path, &checkpoint::export(params), HashMap::from([("parallax".into(), text)]))
+}
+
+/// Reads weights: a file written by [`write_weights`], or a run's folder, which means its `best.safetensors`.
+pub fn load_weights(path: &Path) -> Result<(MonoVit, Params<f32>, RunConfig)> {
+    let path = if path.is_dir() { path.join("best.safetensors") } else { path.to_owned() };
+    let contents = checkpoint::read::<f32>(&path)?;
+    let config = contents.metadata.get("parallax").ok_or_else(|| {
+        Error::file(&path, "holds no configuration of this program: was it written by `parallax train`?")
+    })?;
+    let config: RunConfig =
+        serde_json::from_str(config).map_err(|e| Error::file(&path, format!("its configuration: {e}")))?;
+    let (model, mut params) = MonoVit::new(config.model(), 0);
+    checkpoint::import(&mut params, &contents.tensors, &path)?;
+    Ok((model, params, config))
+}
