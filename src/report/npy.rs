@@ -34,7 +34,7 @@ fn header(shape: &[usize]) -> Vec<u8> {
         _ => shape.iter().map(usize::to_string).collect::<Vec<_>>().join(", "),
     };
     let mut dictionary = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({dimensions}), }}");
-    while (FIXED + dictionary.len() + 1) % 64 != 0 {
+    while !(FIXED + dictionary.len() + 1).is_multiple_of(64) {
         dictionary.push(' ');
     }
     dictionary.push('\n');

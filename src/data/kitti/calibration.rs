@@ -56,6 +56,11 @@ impl Calibration {
         Ok(Calibration { size: (width as usize, height as usize), cameras: cameras_of_sides, lidar_to_rectified })
     }
 
+    /// Whether it was read with the LiDAR.
+    pub fn has_lidar(&self) -> bool {
+        self.lidar_to_rectified.is_some()
+    }
+
     fn camera(&self, side: Side) -> &Projection {
         match side {
             Side::Left => &self.cameras[0],

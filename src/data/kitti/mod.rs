@@ -230,22 +230,21 @@ impl Kitti {
         Ok(())
     }
 
-    fn add_drive(
-        &mut self,
-        folder: &str,
-        path: PathBuf,
-        days: &mut HashMap<PathBuf, Option<Arc<Calibration>>>,
-    ) -> Result<()> {
+    fn add_drive(&mut self, folder: &str, path: PathBuf, days: &mut HashMap<PathBuf, Arc<Calibration>>) -> Result<()> {
         let mut drive = Drive { folder: folder.to_owned(), path, calibration: None };
         let day = drive.day().to_owned();
-        let camera_needs_it = self.options.camera == Camera::Calibrated;
-        let scans_need_it = matches!(self.options.ground_truth, GroundTruth::Lidar(_));
-        let auto = self.options.ground_truth == GroundTruth::Auto;
-        if camera_needs_it || scans_need_it || (auto && Calibration::is_in(&day)) {
+        let measured_camera = self.options.camera == Camera::Calibrated;
+        let with_lidar = match self.options.ground_truth {
+            GroundTruth::Lidar(_) => true,
+            // Depth that nobody insists on does not make the calibration a duty.
+            GroundTruth::Auto => Calibration::is_in(&day),
+            GroundTruth::Improved | GroundTruth::Off => false,
+        };
+        if measured_camera || with_lidar {
             if !days.contains_key(&day) {
-                days.insert(day.clone(), Some(Arc::new(Calibration::read(&day, scans_need_it || auto)?)));
+                days.insert(day.clone(), Arc::new(Calibration::read(&day, with_lidar)?));
             }
-            drive.calibration = days[&day].clone();
+            drive.calibration = days.get(&day).cloned();
         }
         self.drives.push(drive);
         Ok(())
@@ -358,12 +357,10 @@ impl Kitti {
 
     fn scan_depth(&self, frame: Frame, axis: DepthAxis) -> Result<DepthMap> {
         let drive = &self.drives[frame.drive];
-        let Some(calibration) = &drive.calibration else {
+        let lidar = drive.calibration.as_ref().and_then(|c| Some((c, c.lidar_to_image(frame.side)?)));
+        let Some((calibration, projection)) = lidar else {
             return Err(Error::file(drive.day(), "a LiDAR scan needs calib_cam_to_cam.txt and calib_velo_to_cam.txt"));
         };
-        let projection = calibration
-            .lidar_to_image(frame.side)
-            .ok_or_else(|| Error::file(drive.day(), "a LiDAR scan needs calib_velo_to_cam.txt, which was not read"))?;
         let points = read_scan(&drive.scan(frame))?;
         let (width, height) = calibration.size;
         Ok(project_scan(&points, &projection, width, height, axis))
@@ -402,7 +399,9 @@ impl Dataset for Kitti {
             GroundTruth::Improved => read_depth_png(&drive.depth_png(frame)).map(Some),
             GroundTruth::Lidar(axis) => self.scan_depth(frame, axis).map(Some),
             GroundTruth::Auto if drive.depth_png(frame).is_file() => read_depth_png(&drive.depth_png(frame)).map(Some),
-            GroundTruth::Auto if drive.calibration.is_some() && drive.scan(frame).is_file() => {
+            GroundTruth::Auto
+                if drive.calibration.as_ref().is_some_and(|c| c.has_lidar()) && drive.scan(frame).is_file() =>
+            {
                 self.scan_depth(frame, DepthAxis::CameraZ).map(Some)
             }
             GroundTruth::Auto | GroundTruth::Off => Ok(None),

@@ -48,9 +48,8 @@ pub fn frames(folder: &Path) -> Result<BTreeSet<u32>> {
 
 /// The names in a folder; those that are not Unicode cannot be KITTI's.
 fn entries(folder: &Path) -> Result<impl Iterator<Item = String>> {
-    let entries: Vec<_> =
-        fs::read_dir(folder).and_then(Iterator::collect).map_err(|e: std::io::Error| Error::io(folder, e))?;
-    let entries: Vec<fs::DirEntry> = entries;
+    let entries: std::io::Result<Vec<fs::DirEntry>> = fs::read_dir(folder).and_then(Iterator::collect);
+    let entries = entries.map_err(|e| Error::io(folder, e))?;
     Ok(entries.into_iter().filter_map(|entry| entry.file_name().into_string().ok()))
 }
 

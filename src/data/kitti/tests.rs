@@ -142,7 +142,7 @@ fn a_picture_that_is_cut_is_an_error_with_its_path() {
     let root = made_up(3..7);
     let path = root.path().join("day/drive/image_02/data/0000000005.png");
     let picture =
-        RgbImage::from_fn(24, 16, |x, y| Rgb([(x * 31 ^ y * 17) as u8, (x * y * 7) as u8, (x + 9 * y) as u8]));
+        RgbImage::from_fn(24, 16, |x, y| Rgb([((x * 31) ^ (y * 17)) as u8, (x * y * 7) as u8, (x + 9 * y) as u8]));
     picture.save(&path).unwrap();
     let bytes = fs::read(&path).unwrap();
     fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
@@ -236,4 +236,25 @@ fn without_a_list_the_real_piece_gives_its_triplets() {
     let kitti = Kitti::open(&kitti(), None, 96, 320, Options::default()).unwrap();
     // 44 of the drive with 46 frames, twice 5 of the one with 7.
     assert_eq!(kitti.len(), 54);
+    // By itself the depth is the scan's where there is one: frames 8, 16, 24, 32 and 40 of the long drive.
+    let with_depth = (0..kitti.len()).filter(|&i| kitti.depth(i).unwrap().is_some()).count();
+    assert_eq!(with_depth, 5);
+}
+
+#[test]
+fn a_measured_camera_needs_no_lidar() {
+    let root = made_up(3..7);
+    let lines = "S_rect_02: 24 16\nS_rect_03: 24 16\nP_rect_02: 12 0 11 0 0 12 7 0 0 0 1 0\n\
+                 P_rect_03: 12 0 13 0 0 12 7 0 0 0 1 0\n";
+    fs::write(root.path().join("day/calib_cam_to_cam.txt"), lines).unwrap();
+    let scan = root.path().join("day/drive/velodyne_points/data/0000000005.bin");
+    fs::create_dir_all(scan.parent().unwrap()).unwrap();
+    fs::write(&scan, [0; 32]).unwrap();
+    let calibrated = Options { camera: Camera::Calibrated, ..TARGET_ONLY };
+    let kitti = open(root.path(), Some("day/drive 5 r"), calibrated).unwrap();
+    assert_eq!(kitti.intrinsics(0), Intrinsics { fx: 0.5, fy: 0.75, cx: 13.0 / 24.0, cy: 7.0 / 16.0 });
+    // Without the LiDAR's calibration its scan is no depth, unless it is asked for: then it is an error.
+    assert_eq!(kitti.depth(0).unwrap(), None);
+    let lidar = Options { ground_truth: GroundTruth::Lidar(DepthAxis::CameraZ), ..TARGET_ONLY };
+    assert!(message(open(root.path(), Some("day/drive 5 r"), lidar)).contains("calib_velo_to_cam.txt"));
 }
