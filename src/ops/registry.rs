@@ -47,6 +47,10 @@ registry! {
     "permute" => shape_ops::Permute,
     "matmul" => matmul::Matmul,
     "linear" => linear::Linear,
+    "concat" => concat::Concat,
+    "depthwise_conv2d" => depthwise_conv2d::DepthwiseConv2d,
+    "slice" => slice::Slice,
+    "upsample_nearest" => upsample_nearest::UpsampleNearest,
 }
 
 /// One op as the suite sees it.
