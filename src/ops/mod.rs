@@ -11,11 +11,15 @@ pub mod trace;
 
 pub mod binary;
 pub mod conv2d;
+pub mod concat;
+pub mod depthwise_conv2d;
 pub mod linear;
 pub mod matmul;
 pub mod reduce;
 pub mod shape_ops;
+pub mod slice;
 pub mod unary;
+pub mod upsample_nearest;
 
 pub use apply::{apply, apply1};
 pub use case::{Case, Input};

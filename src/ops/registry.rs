@@ -48,6 +48,10 @@ registry! {
     "matmul" => matmul::Matmul,
     "linear" => linear::Linear,
     "conv2d" => conv2d::Conv2d,
+    "concat" => concat::Concat,
+    "depthwise_conv2d" => depthwise_conv2d::DepthwiseConv2d,
+    "slice" => slice::Slice,
+    "upsample_nearest" => upsample_nearest::UpsampleNearest,
 }
 
 /// One op as the suite sees it.
