@@ -50,6 +50,9 @@ registry! {
     "conv2d" => conv2d::Conv2d,
     "concat" => concat::Concat,
     "depthwise_conv2d" => depthwise_conv2d::DepthwiseConv2d,
+    "max_pool2d" => pool2d::MaxPool2d,
+    "avg_pool2d" => pool2d::AvgPool2d,
+    "resize_bilinear" => resize_bilinear::ResizeBilinear,
     "slice" => slice::Slice,
     "upsample_nearest" => upsample_nearest::UpsampleNearest,
 }
