@@ -9,6 +9,7 @@ mod op;
 pub mod registry;
 pub mod trace;
 
+pub mod batch_norm;
 pub mod binary;
 pub mod linear;
 pub mod matmul;

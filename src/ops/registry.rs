@@ -47,6 +47,8 @@ registry! {
     "permute" => shape_ops::Permute,
     "matmul" => matmul::Matmul,
     "linear" => linear::Linear,
+    "batch_norm" => batch_norm::BatchNorm,
+    "batch_norm_eval" => batch_norm::BatchNormEval,
 }
 
 /// One op as the suite sees it.
