@@ -11,6 +11,7 @@ pub mod trace;
 
 pub mod batch_norm;
 pub mod binary;
+pub mod layer_norm;
 pub mod linear;
 pub mod matmul;
 pub mod reduce;

@@ -49,6 +49,7 @@ registry! {
     "linear" => linear::Linear,
     "batch_norm" => batch_norm::BatchNorm,
     "batch_norm_eval" => batch_norm::BatchNormEval,
+    "layer_norm" => layer_norm::LayerNorm,
 }
 
 /// One op as the suite sees it.
