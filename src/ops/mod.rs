@@ -16,6 +16,7 @@ pub mod linear;
 pub mod matmul;
 pub mod reduce;
 pub mod shape_ops;
+pub mod softmax;
 pub mod unary;
 
 pub use apply::{apply, apply1};

@@ -50,6 +50,7 @@ registry! {
     "batch_norm" => batch_norm::BatchNorm,
     "batch_norm_eval" => batch_norm::BatchNormEval,
     "layer_norm" => layer_norm::LayerNorm,
+    "softmax" => softmax::Softmax,
 }
 
 /// One op as the suite sees it.
