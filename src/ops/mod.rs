@@ -11,9 +11,11 @@ pub mod trace;
 
 pub mod batch_norm;
 pub mod binary;
+pub mod factorised_attention;
 pub mod layer_norm;
 pub mod linear;
 pub mod matmul;
+mod per_head;
 pub mod reduce;
 pub mod shape_ops;
 pub mod softmax;

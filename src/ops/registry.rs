@@ -51,6 +51,7 @@ registry! {
     "batch_norm_eval" => batch_norm::BatchNormEval,
     "layer_norm" => layer_norm::LayerNorm,
     "softmax" => softmax::Softmax,
+    "factorised_attention" => factorised_attention::FactorisedAttention,
 }
 
 /// One op as the suite sees it.
