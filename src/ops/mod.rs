@@ -9,6 +9,7 @@ mod op;
 pub mod registry;
 pub mod trace;
 
+pub mod batch_norm;
 pub mod binary;
 pub mod conv2d;
 pub mod concat;
@@ -16,10 +17,16 @@ pub mod depthwise_conv2d;
 pub mod linear;
 pub mod matmul;
 pub mod pool2d;
+pub mod factorised_attention;
+pub mod layer_norm;
+pub mod linear;
+pub mod matmul;
+mod per_head;
 pub mod reduce;
 pub mod resize_bilinear;
 pub mod shape_ops;
 pub mod slice;
+pub mod softmax;
 pub mod unary;
 pub mod upsample_nearest;
 

@@ -55,6 +55,11 @@ registry! {
     "resize_bilinear" => resize_bilinear::ResizeBilinear,
     "slice" => slice::Slice,
     "upsample_nearest" => upsample_nearest::UpsampleNearest,
+    "batch_norm" => batch_norm::BatchNorm,
+    "batch_norm_eval" => batch_norm::BatchNormEval,
+    "layer_norm" => layer_norm::LayerNorm,
+    "softmax" => softmax::Softmax,
+    "factorised_attention" => factorised_attention::FactorisedAttention,
 }
 
 /// One op as the suite sees it.
