@@ -10,11 +10,16 @@ pub mod registry;
 pub mod trace;
 
 pub mod binary;
+pub mod disparity_to_depth;
+pub mod grid_sample;
 pub mod linear;
 pub mod matmul;
+pub mod pose;
 pub mod reduce;
+pub mod rotation;
 pub mod shape_ops;
 pub mod unary;
+pub mod warp;
 
 pub use apply::{apply, apply1};
 pub use case::{Case, Input};

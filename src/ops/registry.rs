@@ -47,6 +47,11 @@ registry! {
     "permute" => shape_ops::Permute,
     "matmul" => matmul::Matmul,
     "linear" => linear::Linear,
+    "axis_angle_to_rotation" => rotation::AxisAngleToRotation,
+    "grid_sample" => grid_sample::GridSample,
+    "warp" => warp::Warp,
+    "pose_matrix" => pose::PoseMatrix,
+    "disparity_to_depth" => unary::Unary<disparity_to_depth::DisparityToDepth>,
 }
 
 /// One op as the suite sees it.
