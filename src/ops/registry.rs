@@ -60,6 +60,11 @@ registry! {
     "layer_norm" => layer_norm::LayerNorm,
     "softmax" => softmax::Softmax,
     "factorised_attention" => factorised_attention::FactorisedAttention,
+    "axis_angle_to_rotation" => rotation::AxisAngleToRotation,
+    "grid_sample" => grid_sample::GridSample,
+    "warp" => warp::Warp,
+    "pose_matrix" => pose::PoseMatrix,
+    "disparity_to_depth" => unary::Unary<disparity_to_depth::DisparityToDepth>,
 }
 
 /// One op as the suite sees it.
