@@ -1,4 +1,5 @@
-//! From a street and a view to a picture and exact depth: one ray at a pixel's centre for depth, nine for colour.
+//! From a street and a view to a picture and exact depth: one ray at a pixel's centre for depth, nine for colour,
+//! which find the edges.
 
 use image::RgbImage;
 use rayon::prelude::*;
@@ -11,8 +12,8 @@ use crate::data::DepthMap;
 
 /// Rays a pixel, along each side.
 const GRID: usize = 3;
-/// A pixel's footprint is taken a little smaller than the pixel: the rays average what is left.
-const FILTER: f32 = 0.8;
+/// A footprint over the pixel it stands for.
+const FILTER: f32 = 1.0;
 
 /// A solid as one view sees it.
 struct Seen<'a> {
@@ -135,24 +136,43 @@ impl<'a> Shader<'a> {
         Shader { scene, across: x.map(|a| a * step[0]), down: y.map(|a| a * step[1]), eye, pixel: step[0].max(step[1]) }
     }
 
-    /// The colour of a pixel: where all its rays meet one solid its texture, which is band-limited, needs only the three
-    /// of a diagonal, which still are one a row and one a column; at edges all nine count.
+    /// The colour of a pixel. Texture is averaged over the pixel's footprint already, so one ray a surface is coloured,
+    /// the one nearest to the middle of that surface's rays, and counts for all of them.
     fn pixel(&self, rays: &[Rays; GRID], x: usize) -> [f32; 3] {
         let first = GRID * x;
-        let who = rays[0].who[first];
-        let inside = rays.iter().all(|row| row.who[first..first + GRID].iter().all(|&w| w == who));
-        let mut sum = [0f32; 3];
-        let mut add = |j: usize, i: usize| {
-            let c = self.ray(&rays[j], first + i);
-            sum = [sum[0] + c[0].min(1.0), sum[1] + c[1].min(1.0), sum[2] + c[2].min(1.0)];
+        let surface = |j: usize, i: usize| {
+            let (row, i) = (&rays[j], first + i);
+            let who = row.who[i];
+            if who == NOTHING { (who, 0) } else { (who, self.seen(who).placed.face(row.direction(i), row.depth[i])) }
         };
-        if inside {
-            (0..GRID).for_each(|k| add(k, k));
-        } else {
-            (0..GRID * GRID).for_each(|k| add(k / GRID, k % GRID));
+        let who = rays[0].who[first];
+        let one = rays.iter().all(|row| row.who[first..first + GRID].iter().all(|&w| w == who));
+        if one && (who == NOTHING || flat(rays, first)) {
+            return self.ray(&rays[GRID / 2], first + GRID / 2).map(|c| c.min(1.0));
         }
-        let n = if inside { GRID } else { GRID * GRID } as f32;
-        sum.map(|c| c / n)
+        let all: [_; GRID * GRID] = std::array::from_fn(|k| surface(k / GRID, k % GRID));
+        let mut sum = [0f32; 3];
+        for (k, &face) in all.iter().enumerate() {
+            if all[..k].contains(&face) {
+                continue;
+            }
+            let (mut n, mut y, mut x) = (0, 0, 0);
+            for m in (k..all.len()).filter(|&m| all[m] == face) {
+                (n, y, x) = (n + 1, y + m / GRID, x + m % GRID);
+            }
+            // Distances to the middle, times the number of rays to stay with whole numbers.
+            let off = |m: usize| (n * (m / GRID)).abs_diff(y).pow(2) + (n * (m % GRID)).abs_diff(x).pow(2);
+            let middle = (k..all.len()).filter(|&m| all[m] == face).min_by_key(|&m| off(m)).unwrap_or(k);
+            let colour = self.ray(&rays[middle / GRID], first + middle % GRID);
+            let weight = n as f32 / all.len() as f32;
+            sum = std::array::from_fn(|c| sum[c] + weight * colour[c].min(1.0));
+        }
+        sum
+    }
+
+    /// What a ray has hit.
+    fn seen(&self, who: u32) -> &Seen<'a> {
+        &self.scene.seen[self.scene.index[who as usize] as usize]
     }
 
     /// The colour of one ray.
@@ -162,7 +182,7 @@ impl<'a> Shader<'a> {
         if rays.who[i] == NOTHING {
             return light.sky(d, self.pixel);
         }
-        let seen = &self.scene.seen[self.scene.index[rays.who[i] as usize] as usize];
+        let seen = self.seen(rays.who[i]);
         let t = rays.depth[i];
         let (axis, normal) = seen.placed.normal(d, t);
         let dot = |a: [f32; 3], b: [f32; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -182,4 +202,13 @@ impl<'a> Shader<'a> {
         }
         light.through(colour.map(|c| c * factor), t)
     }
+}
+
+/// Whether a pixel's rays, all on one solid, hit one plane: on a plane `1/depth` is linear in the picture.
+fn flat(rays: &[Rays; GRID], first: usize) -> bool {
+    let last = GRID - 1;
+    let near = |j: usize, i: usize| 1.0 / rays[j].depth[first + i];
+    let twice = 2.0 * near(GRID / 2, GRID / 2);
+    let off = (twice - near(0, 0) - near(last, last)).abs().max((twice - near(0, last) - near(last, 0)).abs());
+    off < 3e-5 * twice
 }

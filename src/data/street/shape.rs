@@ -287,11 +287,20 @@ fn ellipsoid(centre: [f32; 3], radii: [f32; 3], d: [f32; 3]) -> Option<(f32, f32
 
 /// Whether there are leaves at the point `p` of a crown's shell.
 fn leaves(centre: [f32; 3], p: [f32; 3], seed: u32) -> bool {
-    let cells = 2.2;
-    noise3(std::array::from_fn(|k| (p[k] - centre[k]) * cells), seed) > -0.17
+    let at = |cells: f32| noise3(std::array::from_fn(|k| (p[k] - centre[k]) * cells), seed);
+    at(2.7) + 0.45 * at(6.5) > -0.15
 }
 
 impl Placed {
+    /// Which of a solid's faces is hit at depth `t` along `d`: the axis of its normal, as in [`Self::normal`].
+    pub(crate) fn face(&self, d: [f32; 3], t: f32) -> usize {
+        match self {
+            Placed::Ground { .. } | Placed::Crown { .. } => 1,
+            Placed::Pole { .. } => 0,
+            _ => self.normal(d, t).0,
+        }
+    }
+
     /// The axis that a surface's normal is closest to, and the unit normal towards the eye, at depth `t` along `d`.
     pub(crate) fn normal(&self, d: [f32; 3], t: f32) -> (usize, [f32; 3]) {
         let p = d.map(|x| x * t);
@@ -445,7 +454,8 @@ mod tests {
                     assert!((view.pose.to_camera(p)[2] - t as f64).abs() < 1e-3);
                     let (u, v) = (u as f64, v as f64);
                     assert!(u >= rect[0] - 1e-3 && u <= rect[1] + 1e-3 && v >= rect[2] - 1e-3 && v <= rect[3] + 1e-3);
-                    let (_, n) = placed.normal(d, t);
+                    let (axis, n) = placed.normal(d, t);
+                    assert_eq!(axis, placed.face(d, t));
                     assert!((n.iter().map(|x| x * x).sum::<f32>() - 1.0).abs() < 1e-4);
                     assert!(n[0] * d[0] + n[1] * d[1] + n[2] * d[2] <= 0.0);
                 }

@@ -144,18 +144,23 @@ impl Road {
         let patch = p.patch();
         let Patch { u: x, v: z, du: fx, dv: fz } = patch;
         // Grain at several scales; along the street it is drawn out, as wear is, and outlives the grazing footprint.
-        let mut tone = 1.0 + self.grain * patch.octaves(&[(0.35, 0.30), (0.9, 0.30), (2.3, 0.26), (6.0, 0.26)], seed);
+        let mut tone = 1.0
+            + self.grain
+                * patch
+                    .octaves(&[(0.35, 0.20), (0.9, 0.22), (2.3, 0.26), (6.0, 0.30), (17.0, 0.30), (45.0, 0.25)], seed);
         tone += self.grain * (0.28 * patch.grain(1.7, 0.12, seed + 11) + 0.22 * patch.grain(4.3, 0.35, seed + 12));
         tone += self.grain * 0.35 * patch.grain(0.22, 0.09, seed + 13);
         let tracks = band(x.abs(), 0.5, 1.05, fx.max(0.35));
-        tone -= self.tracks * tracks * (0.8 + patch.grain(0.5, 0.2, seed + 14));
+        if tracks > 0.0 {
+            tone -= self.tracks * tracks * (0.8 + patch.grain(0.5, 0.2, seed + 14));
+        }
         tone *= self.repair(&patch, seed);
         let mut colour = scale(self.colour, tone);
         // The gutter, and leaves and dust in it.
         let gutter = band(x.abs(), self.half - 0.35, self.half, fx.max(0.1));
-        colour = mix(colour, [0.5, 0.48, 0.44], gutter * (0.5 + 0.6 * patch.grain(3.0, 1.3, seed + 15)));
-        // Paint, worn in places.
-        let wear = (0.85 + 1.1 * patch.octaves(&[(0.8, 0.5), (3.1, 0.5)], seed + 20)).clamp(0.2, 1.0);
+        if gutter > 0.0 {
+            colour = mix(colour, [0.5, 0.48, 0.44], gutter * (0.5 + 0.6 * patch.grain(3.0, 1.3, seed + 15)));
+        }
         let line = |at: f32| band(x.abs(), at - 0.5 * self.width, at + 0.5 * self.width, fx);
         let mut paint = line(self.lane) * pulse(z, self.period, self.dash, fz);
         if self.bays {
@@ -164,7 +169,12 @@ impl Road {
         }
         let stripes = band(z, self.crossing, self.crossing + 3.2, fz) * pulse(x + 20.0, 1.0, 0.5, fx);
         paint = paint.max(stripes);
-        mix(colour, WHITE, paint * wear)
+        if paint > 0.0 {
+            // Worn in places.
+            let wear = (0.85 + 1.1 * patch.octaves(&[(0.8, 0.5), (3.1, 0.5)], seed + 20)).clamp(0.2, 1.0);
+            colour = mix(colour, WHITE, paint * wear);
+        }
+        colour
     }
 
     /// Dark and light rectangles of newer and older asphalt, and covers.
@@ -265,13 +275,18 @@ impl Facade {
             }
             let pane = pulse_centred(u, pitch, wide, fu) * row;
             let bars = pulse_centred(u, pitch, 0.07, fu).max(pulse(up - self.sill - 0.62 * high, storey, 0.07, fv));
-            let (i, j) = (floor(u / pitch + 0.5), floor(up / storey));
-            let glass = self.pane(i, j, (up / storey - j as f32) * storey - self.sill, high, &patch, seed);
-            colour = mix(colour, mix(glass, self.trim, bars), storeys * pane);
+            if pane > 0.0 {
+                let (i, j) = (floor(u / pitch + 0.5), floor(up / storey));
+                let glass = self.pane(i, j, up - j as f32 * storey - self.sill, high, &patch, seed);
+                colour = mix(colour, mix(glass, self.trim, bars), storeys * pane);
+            }
             // A belt at each floor.
             colour = mix(colour, self.trim, 0.6 * storeys * pulse(up + 0.09, storey, 0.18, fv));
         }
-        colour = mix(colour, self.ground(&patch, h, plain, seed), band(h, -1.0, self.ground_floor, fv));
+        let below = band(h, -1.0, self.ground_floor, fv);
+        if below > 0.0 {
+            colour = mix(colour, self.ground(&patch, h, plain, seed), below);
+        }
         // The cornice, with brackets; the plinth.
         let cornice = band(h, self.height - 0.45, self.height + 1.0, fv);
         let brackets = 1.0 - 0.35 * pulse(u, 0.6, 0.25, fu) * band(h, self.height - 0.45, self.height - 0.2, fv);

@@ -9,20 +9,29 @@ pub(crate) fn floor(x: f32) -> i32 {
     i - (i as f32 > x) as i32
 }
 
+/// The strides of the hash along x and y, and between seeds: odd, and far from one another.
+const STRIDES: [u32; 3] = [0x9E37_79B1, 0x85EB_CA77, 0xC2B2_AE3D];
+
+fn stir(h: u32) -> u32 {
+    let h = (h ^ (h >> 15)).wrapping_mul(0x2C1B_3C6D);
+    let h = (h ^ (h >> 13)).wrapping_mul(0x297A_2D39);
+    h ^ (h >> 16)
+}
+
+/// The upper 24 bits as a number in `[0, 1)`.
+fn unit(h: u32) -> f32 {
+    (h >> 8) as f32 * (1.0 / (1u32 << 24) as f32)
+}
+
 /// Well-mixed bits of a lattice point.
 pub(crate) fn hash(x: i32, y: i32, seed: u32) -> u32 {
-    let mut h = (x as u32)
-        .wrapping_mul(0x9E37_79B1)
-        .wrapping_add((y as u32).wrapping_mul(0x85EB_CA77))
-        .wrapping_add(seed.wrapping_mul(0xC2B2_AE3D));
-    h = (h ^ (h >> 15)).wrapping_mul(0x2C1B_3C6D);
-    h = (h ^ (h >> 12)).wrapping_mul(0x297A_2D39);
-    h ^ (h >> 15)
+    let [a, b, c] = [x as u32, y as u32, seed];
+    stir(a.wrapping_mul(STRIDES[0]).wrapping_add(b.wrapping_mul(STRIDES[1])).wrapping_add(c.wrapping_mul(STRIDES[2])))
 }
 
 /// `hash` as a number in `[0, 1)`.
 pub(crate) fn hash_unit(x: i32, y: i32, seed: u32) -> f32 {
-    (hash(x, y, seed) >> 8) as f32 * (1.0 / (1u32 << 24) as f32)
+    unit(hash(x, y, seed))
 }
 
 fn ease(t: f32) -> f32 {
@@ -33,9 +42,14 @@ fn ease(t: f32) -> f32 {
 pub(crate) fn noise(u: f32, v: f32, seed: u32) -> f32 {
     let (iu, iv) = (floor(u), floor(v));
     let (fu, fv) = (ease(u - iu as f32), ease(v - iv as f32));
-    let at = |x, y| hash_unit(iu.wrapping_add(x), iv.wrapping_add(y), seed);
-    let top = at(0, 0) + (at(1, 0) - at(0, 0)) * fu;
-    let bottom = at(0, 1) + (at(1, 1) - at(0, 1)) * fu;
+    // The four corners' hashes, with their products shared.
+    let (x0, y0) = ((iu as u32).wrapping_mul(STRIDES[0]), (iv as u32).wrapping_mul(STRIDES[1]));
+    let y0 = y0.wrapping_add(seed.wrapping_mul(STRIDES[2]));
+    let (x1, y1) = (x0.wrapping_add(STRIDES[0]), y0.wrapping_add(STRIDES[1]));
+    let at = |x: u32, y: u32| unit(stir(x.wrapping_add(y)));
+    let (left, low) = (at(x0, y0), at(x0, y1));
+    let top = left + (at(x1, y0) - left) * fu;
+    let bottom = low + (at(x1, y1) - low) * fu;
     top + (bottom - top) * fv - 0.5
 }
 
@@ -124,6 +138,13 @@ mod tests {
             (low, high, sum) = (low.min(a), high.max(a), sum + a as f64);
         }
         assert!(low < -0.4 && high > 0.4 && (sum / n as f64).abs() < 0.02, "{low} {high} {sum}");
+    }
+
+    #[test]
+    fn noise_at_a_lattice_point_is_its_hash() {
+        for (x, y) in [(0, 0), (3, -4), (-7, 12)] {
+            assert_eq!(noise(x as f32, y as f32, 9), hash_unit(x, y, 9) - 0.5);
+        }
     }
 
     #[test]
