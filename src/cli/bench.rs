@@ -86,7 +86,7 @@ pub fn run(args: Args) -> Result<()> {
         let c = Context::inference(&trainer.params);
         trainer.model.disparities(&c, &Var::constant(batch.seen[1].clone()));
     };
-    let mut once = |trainer: &mut Trainer| match step {
+    let once = |trainer: &mut Trainer| match step {
         true => trainer.step(&batch).map(drop),
         false => {
             infer(trainer);
@@ -122,9 +122,15 @@ pub fn run(args: Args) -> Result<()> {
     if sizes.json {
         return super::print_json(&timing);
     }
-    println!("{:24} {:16} {:>5} {:>8} {:>10} {:>11}", "op", "kernel path", "calls", "GFLOP", "forward ms", "backward ms");
+    println!(
+        "{:24} {:16} {:>5} {:>8} {:>10} {:>11}",
+        "op", "kernel path", "calls", "GFLOP", "forward ms", "backward ms"
+    );
     for r in &timing.breakdown {
-        println!("{:24} {:16} {:5} {:8.3} {:10.2} {:11.2}", r.op, r.algo, r.calls, r.gflop, r.forward_ms, r.backward_ms);
+        println!(
+            "{:24} {:16} {:5} {:8.3} {:10.2} {:11.2}",
+            r.op, r.algo, r.calls, r.gflop, r.forward_ms, r.backward_ms
+        );
     }
     println!(
         "\nmedian {:.4} s, {:.2} GFLOP, {:.1} GFLOP/s, peak memory {:.0} MiB, {:.1} fresh buffers",
@@ -184,7 +190,14 @@ fn breakdown(entries: &[Entry], total: f64) -> Vec<Row> {
     let mut rows: Vec<Row> = rows.into_values().collect();
     rows.sort_by(|a, b| (b.forward_ms + b.backward_ms).total_cmp(&(a.forward_ms + a.backward_ms)));
     // AdamW, running statistics, gradients added where paths meet, and whatever else is no op.
-    rows.push(Row { op: "other".into(), algo: String::new(), calls: 1, gflop: 0.0, forward_ms: rest, backward_ms: 0.0 });
+    rows.push(Row {
+        op: "other".into(),
+        algo: String::new(),
+        calls: 1,
+        gflop: 0.0,
+        forward_ms: rest,
+        backward_ms: 0.0,
+    });
     rows
 }
 

@@ -46,7 +46,9 @@ struct StreetArgs {
 
 pub fn run(args: Args) -> Result<()> {
     let What::Street(a) = args.what;
-    for (name, value) in [("--sequences", a.sequences), ("--frames", a.frames), ("--height", a.height), ("--width", a.width)] {
+    for (name, value) in
+        [("--sequences", a.sequences), ("--frames", a.frames), ("--height", a.height), ("--width", a.width)]
+    {
         if value == 0 || value > 20_000 {
             return Err(Error::setting(name, format!("{value} is not from 1 to 20000")));
         }

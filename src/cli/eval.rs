@@ -66,7 +66,15 @@ pub fn run(args: Args) -> Result<()> {
     }
     let m = report.metrics;
     println!("images    {}", report.images);
-    for (name, value) in [("Abs Rel", m.abs_rel), ("Sq Rel", m.sq_rel), ("RMSE", m.rmse), ("RMSE log", m.rmse_log), ("a1", m.a1), ("a2", m.a2), ("a3", m.a3)] {
+    for (name, value) in [
+        ("Abs Rel", m.abs_rel),
+        ("Sq Rel", m.sq_rel),
+        ("RMSE", m.rmse),
+        ("RMSE log", m.rmse_log),
+        ("a1", m.a1),
+        ("a2", m.a2),
+        ("a3", m.a3),
+    ] {
         println!("{name:9} {value:.4}");
     }
     if let (Some(ratio), Some(std)) = (report.ratio_median, report.ratio_std) {

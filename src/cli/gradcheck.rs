@@ -76,7 +76,10 @@ pub fn run(args: Args) -> Result<()> {
     if args.json {
         super::print_json(&table)?;
     } else {
-        println!("{:24} {:16} {:>5} {:>8} {:>5} {:>9} {:>8}", "op", "kernel path", "cases", "elements", "kinks", "max error", "ms");
+        println!(
+            "{:24} {:16} {:>5} {:>8} {:>5} {:>9} {:>8}",
+            "op", "kernel path", "cases", "elements", "kinks", "max error", "ms"
+        );
         for r in &table.ops {
             println!(
                 "{:24} {:16} {:5} {:8} {:5} {:9.1e} {:8.1}",

@@ -21,7 +21,9 @@ impl Progress {
     pub fn new(what: &'static str, total: u64) -> Self {
         let plain = !std::io::stderr().is_terminal();
         let bar = if plain { ProgressBar::hidden() } else { ProgressBar::new(total) };
-        if let Ok(style) = ProgressStyle::with_template("{prefix:>10} [{bar:32}] {pos}/{len} {per_sec} {eta} left {msg}") {
+        if let Ok(style) =
+            ProgressStyle::with_template("{prefix:>10} [{bar:32}] {pos}/{len} {per_sec} {eta} left {msg}")
+        {
             bar.set_style(style.progress_chars("=> "));
         }
         bar.set_prefix(what);

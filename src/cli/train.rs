@@ -94,25 +94,37 @@ pub fn run(args: Args) -> Result<()> {
             let folder = args.out.clone().unwrap_or_else(|| next_free("runs"));
             let data = open(&config)?;
             if let Some(epochs) = args.epochs {
-                set_steps(&mut config, epochs * data.train.len().div_ceil(config.batch.max(1)) as u64);
+                let a_pass = data.train.len().div_ceil(config.batch.max(1)) as u64;
+                set_steps(&mut config, epochs * a_pass);
             }
             enough(&data, &config)?;
             (Run::create(&folder, config)?, data)
         }
     };
-    eprintln!("training {} on {} samples, {} steps of {}; everything goes to {}", run.config.preset.name(), data.train.len(), run.config.steps, run.config.batch, run.folder.display());
+    eprintln!(
+        "training {} on {} samples, {} steps of {}; everything goes to {}",
+        run.config.preset.name(),
+        data.train.len(),
+        run.config.steps,
+        run.config.batch,
+        run.folder.display()
+    );
     let mut progress = Progress::new("training", run.config.steps);
-    let ended = run.train(&data, || stop.load(Ordering::SeqCst), |event| match event {
-        Event::Phase(what) => progress.say(what),
-        Event::Step(r) => {
-            let note = format!("loss {:.4} photometric {:.4} (unwarped {:.4})", r.loss, r.photometric, r.unwarped);
-            progress.set(r.step, &note);
-        }
-        Event::Validated(step, error, best) => {
-            let best = if best { ", the best so far" } else { "" };
-            progress.say(&format!("step {step}: photometric error on validation data {error:.4}{best}"));
-        }
-    })?;
+    let ended = run.train(
+        &data,
+        || stop.load(Ordering::SeqCst),
+        |event| match event {
+            Event::Phase(what) => progress.say(what),
+            Event::Step(r) => {
+                let note = format!("loss {:.4} photometric {:.4} (unwarped {:.4})", r.loss, r.photometric, r.unwarped);
+                progress.set(r.step, &note);
+            }
+            Event::Validated(step, error, best) => {
+                let best = if best { ", the best so far" } else { "" };
+                progress.say(&format!("step {step}: photometric error on validation data {error:.4}{best}"));
+            }
+        },
+    )?;
     progress.finish();
     let folder = run.folder.display();
     match ended {
@@ -135,7 +147,10 @@ pub fn run(args: Args) -> Result<()> {
 
 fn print_metrics(m: &RunMetrics) {
     eprintln!("\n{} images that nothing was chosen on ({})", m.images, m.test);
-    eprintln!("{:14} {:>8} {:>8} {:>8} {:>9} {:>6} {:>6} {:>6}", "", "Abs Rel", "Sq Rel", "RMSE", "RMSE log", "a1", "a2", "a3");
+    eprintln!(
+        "{:14} {:>8} {:>8} {:>8} {:>9} {:>6} {:>6} {:>6}",
+        "", "Abs Rel", "Sq Rel", "RMSE", "RMSE log", "a1", "a2", "a3"
+    );
     let row = |name: &str, m: &Metrics| {
         eprintln!(
             "{name:14} {:8.4} {:8.4} {:8.3} {:9.4} {:6.3} {:6.3} {:6.3}",
@@ -188,7 +203,8 @@ fn next_free(parent: &str) -> PathBuf {
 
 fn enough(data: &RunData, config: &RunConfig) -> Result<()> {
     if data.train.len() < config.batch {
-        let message = format!("{} samples a batch, but the data holds {}: make it smaller", config.batch, data.train.len());
+        let message =
+            format!("{} samples a batch, but the data holds {}: make it smaller", config.batch, data.train.len());
         return Err(Error::setting("--batch", message));
     }
     Ok(())
@@ -221,7 +237,8 @@ fn open(config: &RunConfig) -> Result<RunData> {
         });
     }
     let root = Path::new(&config.data);
-    let all: Arc<dyn Dataset> = Arc::new(Kitti::open(root, config.split.as_deref(), height, width, Options::default())?);
+    let all: Arc<dyn Dataset> =
+        Arc::new(Kitti::open(root, config.split.as_deref(), height, width, Options::default())?);
     Ok(match &config.val_split {
         Some(split) => {
             let validation = Arc::new(Kitti::open(root, Some(split), height, width, Options::default())?);

@@ -15,8 +15,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::Result;
 
-
-
 /// Pinhole intrinsics in units of the image size, so that they hold at any resolution:
 /// `u = fx * W * x/z + cx * W`, `v = fy * H * y/z + cy * H`, pixel centres at whole numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

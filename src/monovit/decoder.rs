@@ -29,8 +29,7 @@ pub struct Decoder {
 }
 
 /// The nodes in the order in which they can be computed.
-const ORDER: [(usize, usize); 10] =
-    [(0, 1), (1, 1), (2, 1), (3, 1), (0, 2), (1, 2), (2, 2), (0, 3), (1, 3), (0, 4)];
+const ORDER: [(usize, usize); 10] = [(0, 1), (1, 1), (2, 1), (3, 1), (0, 2), (1, 2), (2, 2), (0, 3), (1, 3), (0, 4)];
 
 /// Whether a node is made by channel attention: those on the diagonal.
 fn on_diagonal((i, j): (usize, usize)) -> bool {

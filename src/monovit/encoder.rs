@@ -4,7 +4,7 @@
 //! embedding through transformer layers and the first one through a convolutional block beside them, and fuses all.
 
 use super::config::Config;
-use crate::nn::{BatchNorm, Builder, Context, ConvBn, DepthwiseConv, Conv, ConvStart, Init, LayerNorm, Linear};
+use crate::nn::{BatchNorm, Builder, Context, Conv, ConvBn, ConvStart, DepthwiseConv, Init, LayerNorm, Linear};
 use crate::ops::Conv2d;
 use crate::ops::batch_norm::Activation;
 use crate::tensor::{Float, Var};
@@ -35,7 +35,9 @@ impl Encoder {
             .map(|i| {
                 let mut b = b.at(format!("patch_embed_stages.{i}.patch_embeds"));
                 (0..config.paths[i])
-                    .map(|p| PatchEmbedding::new(&mut b.at(format!("{p}.patch_conv")), d[i], if p == 0 { 2 } else { 1 }))
+                    .map(|p| {
+                        PatchEmbedding::new(&mut b.at(format!("{p}.patch_conv")), d[i], if p == 0 { 2 } else { 1 })
+                    })
                     .collect()
             })
             .collect();
@@ -258,10 +260,14 @@ impl TransformerLayer {
         let x = (x + position.forward(c, x)).reshape([b, h * w, channels]);
 
         let qkv = self.qkv.forward(c, &self.norm1.forward(c, &x));
-        let windows: Vec<_> = relative.windows.iter().map(|(window, heads, conv)| {
-            let (weight, bias) = conv.params();
-            (*window, *heads, c.var(weight), c.var(bias.expect("made with a bias")))
-        }).collect();
+        let windows: Vec<_> = relative
+            .windows
+            .iter()
+            .map(|(window, heads, conv)| {
+                let (weight, bias) = conv.params();
+                (*window, *heads, c.var(weight), c.var(bias.expect("made with a bias")))
+            })
+            .collect();
         let attention = qkv.factorised_attention(self.heads) + qkv.conv_relative_position(h, w, self.heads, &windows);
         let x = x + c.drop_path(self.proj.forward(c, &attention), self.drop_path);
 

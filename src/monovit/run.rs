@@ -234,9 +234,8 @@ impl Run {
         let log = folder.join("log.jsonl");
         if let Ok(text) = fs::read_to_string(&log) {
             let done = run.trainer.steps();
-            let step = |line: &&str| {
-                serde_json::from_str::<serde_json::Value>(line).ok().and_then(|v| v["step"].as_u64())
-            };
+            let step =
+                |line: &&str| serde_json::from_str::<serde_json::Value>(line).ok().and_then(|v| v["step"].as_u64());
             let kept: String =
                 text.lines().filter(|l| step(l).is_some_and(|s| s <= done)).flat_map(|l| [l, "\n"]).collect();
             write_bytes_atomically(&log, kept.as_bytes())?;

@@ -138,7 +138,9 @@ impl Trainer {
         if !grad_norm.is_finite() {
             let bad = self.params.iter().zip(&gradients).find(|(_, g)| g.as_ref().is_some_and(|g| !g.is_finite()));
             let name = bad.map_or("of a parameter", |((_, p), _)| p.name());
-            return Err(Error::Failed(format!("step {step}: the gradient of {name} is not finite (the loss is {total})")));
+            return Err(Error::Failed(format!(
+                "step {step}: the gradient of {name} is not finite (the loss is {total})"
+            )));
         }
         let factor = self.optim.schedule.factor(step);
         let learning_rates = [self.optim.encoder_rate * factor, self.optim.rate * factor];

@@ -10,10 +10,7 @@ use crate::error::{Error, Result};
 use crate::tensor::{Float, Tensor};
 
 /// The bytes of a checkpoint: every tensor under its own name, in PyTorch's layout, in f32, and `metadata`.
-pub fn to_bytes<T: Float>(
-    tensors: &BTreeMap<String, Tensor<T>>,
-    metadata: HashMap<String, String>,
-) -> Result<Vec<u8>> {
+pub fn to_bytes<T: Float>(tensors: &BTreeMap<String, Tensor<T>>, metadata: HashMap<String, String>) -> Result<Vec<u8>> {
     let bytes: Vec<(&String, Vec<usize>, Vec<u8>)> = tensors
         .iter()
         .map(|(name, t)| {
@@ -60,7 +57,10 @@ pub fn read<T: Float>(path: &Path) -> Result<Contents<T>> {
     let mut tensors = HashMap::new();
     for (name, view) in file.tensors() {
         if view.shape().len() > crate::tensor::shape::MAX_RANK {
-            return Err(Error::file(path, format!("{name} has {} dimensions, more than a tensor can", view.shape().len())));
+            return Err(Error::file(
+                path,
+                format!("{name} has {} dimensions, more than a tensor can", view.shape().len()),
+            ));
         }
         let data = view.data();
         let numbers: Vec<T> = match view.dtype() {
@@ -102,10 +102,8 @@ pub fn import<T: Float>(params: &mut Params<T>, tensors: &HashMap<String, Tensor
         };
         found.push((id, ours));
     }
-    let unexpected: Vec<&String> = tensors
-        .keys()
-        .filter(|n| params.find(n).is_none() && !n.ends_with("num_batches_tracked"))
-        .collect();
+    let unexpected: Vec<&String> =
+        tensors.keys().filter(|n| params.find(n).is_none() && !n.ends_with("num_batches_tracked")).collect();
     if !missing.is_empty() || !unexpected.is_empty() {
         let mut message = format!("{} tensors are missing, {} are unexpected", missing.len(), unexpected.len());
         for (what, name) in [("missing", missing.first()), ("unexpected", unexpected.first().copied())] {

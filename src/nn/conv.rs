@@ -37,8 +37,7 @@ impl Conv {
         let fan_in = Init::FanIn(inputs * kernel * kernel);
         let init = if start == ConvStart::He { Init::he(kernel, outputs) } else { fan_in };
         let weight = b.param("weight", [kernel, kernel, inputs, outputs], Layout::Conv, init);
-        let bias =
-            (start == ConvStart::FanInWithBias).then(|| b.param("bias", [outputs], Layout::Same, fan_in));
+        let bias = (start == ConvStart::FanInWithBias).then(|| b.param("bias", [outputs], Layout::Same, fan_in));
         Conv { weight, bias, op }
     }
 

@@ -64,6 +64,11 @@ registry! {
     "grid_sample" => grid_sample::GridSample,
     "warp" => warp::Warp,
     "pose_matrix" => pose::PoseMatrix,
+    "conv_relative_position" => conv_relative_position::ConvRelativePosition,
+    "ssim_loss" => ssim::SsimLoss,
+    "photometric" => photometric::Photometric,
+    "smoothness" => smoothness::Smoothness,
+    "min_reprojection" => min_reprojection::MinReprojection,
     "disparity_to_depth" => unary::Unary<disparity_to_depth::DisparityToDepth>,
 }
 

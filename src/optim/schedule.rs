@@ -46,7 +46,13 @@ impl Schedule {
         let warm = if step < self.warm_up { step as f64 / self.warm_up as f64 } else { 1.0 };
         warm * match self.decay {
             Decay::Constant => 1.0,
-            Decay::Step { at, factor } => if step > at { factor } else { 1.0 },
+            Decay::Step { at, factor } => {
+                if step > at {
+                    factor
+                } else {
+                    1.0
+                }
+            }
             Decay::Exponential { every, factor } => factor.powf(((step.max(1) - 1) / every.max(1)) as f64),
             Decay::Cosine { steps, end } => {
                 let span = steps.saturating_sub(self.warm_up).max(1) as f64;
