@@ -1,0 +1,165 @@
+//! A whole MonoViT with 225,092 parameters against PyTorch reference values: outputs, loss, the gradient of every
+//! parameter, three AdamW steps, and evaluation after them.
+
+use std::collections::HashMap;
+use std::path::Path;
+
+use parallax::monovit::loss::{Loss, LossConfig, Views, loss};
+use parallax::monovit::{MonoVit, Preset};
+use parallax::nn::{Context, Params, checkpoint};
+use parallax::optim::{AdamW, Group};
+use parallax::random::Random;
+use parallax::tensor::{Float, Tape, Tensor, Var};
+
+struct Reference<T: Float>(HashMap<String, Tensor<T>>);
+
+impl<T: Float> Reference<T> {
+    fn read() -> Self {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/pico.safetensors");
+        Reference(checkpoint::read(&path).expect("the fixture").tensors)
+    }
+
+    fn get(&self, name: &str) -> &Tensor<T> {
+        self.0.get(name).unwrap_or_else(|| panic!("the fixture has no {name}"))
+    }
+
+    /// An image or map, from NCHW to NHWC.
+    fn map(&self, name: &str) -> Tensor<T> {
+        self.get(name).permute(&[0, 2, 3, 1])
+    }
+
+    /// The tensors under a prefix.
+    fn under(&self, prefix: &str) -> HashMap<String, Tensor<T>> {
+        self.0.iter().filter_map(|(n, t)| Some((n.strip_prefix(prefix)?.to_owned(), t.clone()))).collect()
+    }
+}
+
+struct Pico<T: Float> {
+    model: MonoVit,
+    params: Params<T>,
+    reference: Reference<T>,
+}
+
+impl<T: Float> Pico<T> {
+    fn load() -> Self {
+        let reference = Reference::read();
+        let (model, mut params) = MonoVit::new(Preset::Pico.config(), 0);
+        checkpoint::import(&mut params, &reference.under("weights/"), Path::new("pico")).expect("the same names and shapes");
+        Pico { model, params, reference }
+    }
+
+    fn views(&self) -> Views<T> {
+        let k = self.reference.get("in/K");
+        let intrinsics = [k.at(&[0, 0]), k.at(&[1, 1]), k.at(&[0, 2]), k.at(&[1, 2])].map(Float::f64);
+        let pyramid = ["in/target", "in/pyramid/1", "in/pyramid/2", "in/pyramid/3"];
+        Views {
+            pyramid: pyramid.map(|n| self.reference.map(n).into()).into(),
+            sources: ["in/prev", "in/next"].map(|n| self.reference.map(n).into()).into(),
+            intrinsics: vec![intrinsics; 2],
+        }
+    }
+
+    fn forward(&self, tape: &Tape<T>) -> (Context<T>, Vec<Var<T>>, Loss<T>) {
+        let c = Context::training(&self.params, tape, Random::new(0, 0));
+        let [prev, target, next] = ["in/prev", "in/target", "in/next"].map(|n| Var::constant(self.reference.map(n)));
+        let disparities = self.model.disparities(&c, &target);
+        let transforms = self.model.transforms(&c, &prev, &target, &next);
+        let found = loss(&disparities, &transforms, &self.views(), &LossConfig::default(), None);
+        (c, disparities, found)
+    }
+}
+
+/// max |difference| over max |expected|.
+fn error<T: Float>(found: &Tensor<T>, expected: &Tensor<T>) -> f64 {
+    assert_eq!(found.shape(), expected.shape());
+    let largest = |it: &mut dyn Iterator<Item = f64>| it.fold(0.0, |m: f64, x| if x.is_nan() { x } else { m.max(x) });
+    let scale = largest(&mut expected.data().iter().map(|x| x.f64().abs()));
+    largest(&mut found.data().iter().zip(expected.data()).map(|(a, b)| (a.f64() - b.f64()).abs())) / scale
+}
+
+fn assert_error<T: Float>(found: &Tensor<T>, expected: &Tensor<T>, bound: f64, what: &str) {
+    let e = error(found, expected);
+    assert!(e <= bound, "{what}: error {e:.1e}, at most {bound:.0e} expected");
+}
+
+fn outputs_and_gradients<T: Float>(bound: f64, gradient_bound: f64, zero: f64) {
+    let pico = Pico::<T>::load();
+    let target = Var::constant(pico.reference.map("in/target"));
+
+    let c = Context::training(&pico.params, &Tape::new(), Random::new(0, 0));
+    for (i, feature) in pico.model.features(&c, &target).iter().enumerate() {
+        assert_error(feature.value(), &pico.reference.map(&format!("out/feature/{i}")), bound, &format!("feature {i}"));
+    }
+    let [prev, next] = ["in/prev", "in/next"].map(|n| Var::constant(pico.reference.map(n)));
+    for (name, first, second) in [("out/pose/prev", &prev, &target), ("out/pose/next", &target, &next)] {
+        let motion = pico.model.motion(&c, first, second);
+        assert_error(motion.value(), pico.reference.get(name), bound, name);
+    }
+
+    let (c, disparities, found) = pico.forward(&Tape::new());
+    for (s, disparity) in disparities.iter().enumerate() {
+        assert_error(disparity.value(), &pico.reference.map(&format!("out/disp/{s}")), bound, &format!("disparity {s}"));
+    }
+    let expected = pico.reference.get("out/losses").data()[0].f64();
+    let total = found.total.value().item().f64();
+    assert!((total - expected).abs() <= bound * expected, "loss {total}, expected {expected}");
+
+    let mut all = found.total.backward();
+    let gradients = c.gradients(&mut all);
+    let mut compared = 0;
+    for ((_, p), gradient) in pico.params.iter().zip(&gradients) {
+        let expected = pico.reference.0.get(&format!("grad/{}", p.name()));
+        assert_eq!(gradient.is_some(), expected.is_some(), "{}: whether there is a gradient", p.name());
+        let (Some(gradient), Some(expected)) = (gradient, expected) else { continue };
+        compared += 1;
+        let gradient = p.layout.export(gradient);
+        let scale = expected.data().iter().fold(0.0, |m: f64, x| m.max(x.f64().abs()));
+        for (k, (g, e)) in gradient.data().iter().zip(expected.data()).enumerate() {
+            let difference = (g.f64() - e.f64()).abs();
+            let bound = gradient_bound * scale + zero;
+            assert!(difference <= bound, "{}, element {k}: {g} for {e} (bound {bound:.1e})", p.name());
+        }
+    }
+    assert_eq!(compared, 501, "parameters with a gradient");
+}
+
+#[test]
+fn outputs_and_gradients_in_f64() {
+    outputs_and_gradients::<f64>(1e-10, 1e-8, 1e-15);
+}
+
+#[test]
+fn outputs_and_gradients_in_f32() {
+    // The gradients that are zero by construction (constants before a normalisation) are rounding noise in f32.
+    outputs_and_gradients::<f32>(1e-4, 1e-4, 1e-6);
+}
+
+#[test]
+fn three_steps_and_evaluation_in_f64() {
+    let mut pico = Pico::<f64>::load();
+    let mut adamw = AdamW::new(&pico.params);
+    let losses = pico.reference.get("out/losses").clone();
+    for step in 0..3 {
+        let (c, _, found) = pico.forward(&Tape::new());
+        let (total, expected) = (found.total.value().item(), losses.data()[step]);
+        assert!((total - expected).abs() <= 1e-9 * expected, "loss before step {}: {total} for {expected}", step + 1);
+        let gradients = c.gradients(&mut found.total.backward());
+        adamw.step(&mut pico.params, &gradients, |name| Group {
+            learning_rate: if name.starts_with("encoder.") { 5e-5 } else { 1e-4 },
+            decay: 0.01,
+        });
+        for (id, value) in c.into_moved() {
+            pico.params.set(id, value);
+        }
+    }
+    for (_, p) in pico.params.iter() {
+        let expected = pico.reference.get(&format!("after3/{}", p.name()));
+        assert_error(&p.layout.export(&p.value), expected, 1e-9, p.name());
+    }
+    let c = Context::inference(&pico.params);
+    let target = Var::constant(pico.reference.map("in/target"));
+    for (s, disparity) in pico.model.disparities(&c, &target).iter().enumerate() {
+        let expected = pico.reference.map(&format!("eval_after3/disp/{s}"));
+        assert_error(disparity.value(), &expected, 1e-9, &format!("disparity {s}"));
+    }
+}
