@@ -160,12 +160,11 @@ fn larger(a: f32, b: f32) -> f32 {
 impl Rays {
     /// The rays through the points `columns` (pixels) of the row `v`.
     pub(crate) fn aim(&mut self, view: &View, v: f64, columns: &[f32]) {
-        let r = &view.pose.rotation;
         let y = (v - view.centre[1]) / view.focal[1];
         let n = columns.len();
-        for k in 0..3 {
-            let base = (r[k][1] * y + r[k][2]) as f32;
-            let step = r[k][0] as f32;
+        for (k, r) in view.pose.rotation.iter().enumerate() {
+            let base = (r[1] * y + r[2]) as f32;
+            let step = r[0] as f32;
             self.d[k].clear();
             self.d[k].extend(columns.iter().map(|&x| base + step * x));
             self.inverse[k].clear();
