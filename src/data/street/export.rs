@@ -25,11 +25,11 @@ const DEEPEST: f32 = 250.0;
 /// (`poses.txt`: the twelve numbers of `[R | C]`, a line a frame), the calibration and a split file with every frame
 /// that has both neighbours. Refuses a folder that exists and is not empty.
 pub fn write(street: &Street, out: &Path) -> Result<()> {
-    if let Ok(mut entries) = fs::read_dir(out) {
-        if entries.next().is_some() {
-            let message = "the folder is not empty; give a new one, or empty it first: nothing was written";
-            return Err(Error::file(out, message));
-        }
+    if let Ok(mut entries) = fs::read_dir(out)
+        && entries.next().is_some()
+    {
+        let message = "the folder is not empty; give a new one, or empty it first: nothing was written";
+        return Err(Error::file(out, message));
     }
     let config = street.config();
     let day = out.join(DAY);

@@ -20,6 +20,8 @@ struct Seen<'a> {
     solid: &'a Solid,
     placed: Placed,
     rect: Rect,
+    /// How far ahead of the eye it begins along the street, in metres.
+    near: f64,
     /// The origin of its texture, relative to the eye.
     origin: [f32; 3],
     who: u32,
@@ -51,8 +53,13 @@ impl<'a> Scene<'a> {
             let eye = view.pose.position;
             let origin = [solid.origin[0], solid.origin[1], solid.origin[2] + by];
             let origin = std::array::from_fn(|k| (origin[k] - eye[k]) as f32);
-            index[who] = seen.len() as u32;
-            seen.push(Seen { solid, placed: shape.place(eye), rect, origin, who: who as u32 });
+            let near = shape.bounds().map_or(0.0, |(low, _)| low[2] - eye[2]);
+            seen.push(Seen { solid, placed: shape.place(eye), rect, near, origin, who: who as u32 });
+        }
+        // Nearest first, so that what is hidden is left alone early; a stable sort keeps ties in order.
+        seen.sort_by(|a: &Seen, b: &Seen| a.near.total_cmp(&b.near));
+        for (i, seen) in seen.iter().enumerate() {
+            index[seen.who as usize] = i as u32;
         }
         Scene { world, view, frame, seen, index }
     }

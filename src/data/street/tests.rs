@@ -275,6 +275,14 @@ fn samples_are_named_and_bounded_and_progress_is_told() {
     assert!(street.relative_pose(4, 1)[2][3] < -0.4, "the next camera is ahead, so points come nearer");
 }
 
+#[test]
+fn a_configuration_reads_back_and_may_leave_fields_out() {
+    let config = StreetConfig { seed: 3, moving_cars: true, ..StreetConfig::default() };
+    assert_eq!(toml::from_str::<StreetConfig>(&toml::to_string(&config).unwrap()).unwrap(), config);
+    assert_eq!(toml::from_str::<StreetConfig>("seed = 3\nmoving_cars = true").unwrap(), config);
+    assert!(toml::from_str::<StreetConfig>("sede = 3").is_err());
+}
+
 /// `STREET_PICTURES=DIR cargo test --lib pictures_to_look_at -- --ignored --nocapture`
 #[test]
 #[ignore = "writes pictures to look at, and says how long the default street takes"]
