@@ -14,10 +14,14 @@ pub mod disparity_to_depth;
 pub mod grid_sample;
 pub mod linear;
 pub mod matmul;
+pub mod min_reprojection;
+pub mod photometric;
 pub mod pose;
 pub mod reduce;
 pub mod rotation;
 pub mod shape_ops;
+pub mod smoothness;
+pub mod ssim;
 pub mod unary;
 pub mod warp;
 

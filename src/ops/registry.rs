@@ -50,6 +50,10 @@ registry! {
     "axis_angle_to_rotation" => rotation::AxisAngleToRotation,
     "grid_sample" => grid_sample::GridSample,
     "warp" => warp::Warp,
+    "ssim_loss" => ssim::SsimLoss,
+    "photometric" => photometric::Photometric,
+    "smoothness" => smoothness::Smoothness,
+    "min_reprojection" => min_reprojection::MinReprojection,
     "pose_matrix" => pose::PoseMatrix,
     "disparity_to_depth" => unary::Unary<disparity_to_depth::DisparityToDepth>,
 }

@@ -1,1 +1,4 @@
-fn main() {}
+//! Against PyTorch reference values, in f64.
+
+mod ops;
+mod reference;
