@@ -243,7 +243,7 @@ impl Kernel {
             let loss = half - half * s;
             let inside = !(loss < T::ZERO || loss > T::ONE);
             let g = if inside { g * factor } else { T::ZERO };
-            // 1/d2 - 1/d1 = (d1 - d2) / D, and 1/d2 = d1 / D.
+            // 1/d2 - 1/d1 = (d1 - d2) / D, and 1/d2 = d1 / D; the 2 of 2 x Q is in q already.
             let scale = two * g * over;
             *a = scale * (y * (n2 - n1) + x * s * (d1 - d2));
             *q = -(scale * s * d1);
@@ -296,7 +296,7 @@ impl Kernel {
             u.iter().zip(c.iter()).zip(d.iter()).map(move |((&u, &c), &d)| u.mul_add(above, d.mul_add(below, c)))
         });
         for ((o, ((&x, &y), &g)), ((a, q), p)) in out.iter_mut().zip(pixels).zip(a.zip(q).zip(p)) {
-            write(o, (x + x).mul_add(q, y.mul_add(p, a)) + l1 * g * sign(x - y));
+            write(o, x.mul_add(q, y.mul_add(p, a)) + l1 * g * sign(x - y));
         }
     }
 }

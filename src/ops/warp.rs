@@ -515,3 +515,89 @@ impl<T: Float> Var<T> {
         apply1(op, &[self, depth, transform])
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ops::grid_sample::GridPadding;
+    use crate::random::Random;
+    use crate::tensor::Tape;
+
+    fn uniform(random: &mut Random, shape: impl Into<Shape>, low: f64, high: f64) -> Tensor<f64> {
+        let shape = shape.into();
+        Tensor::from_vec(shape, (0..shape.len()).map(|_| random.uniform(low, high)).collect())
+    }
+
+    /// The same, step by step, of ops that know nothing of cameras.
+    fn composed(v: &[Var<f64>], [fx, fy, cx, cy]: [f64; 4]) -> Var<f64> {
+        let constant = |shape: &[usize], x: Vec<f64>| Var::constant(Tensor::from_vec(shape, x));
+        let [batch, height, width, _] = v[0].shape().nhwc().unwrap();
+        let pixels = (0..height * width).map(|i| ((i % width) as f64, (i / width) as f64));
+        let rays = pixels.flat_map(|(x, y)| [(x - cx) / fx, (y - cy) / fy, 1.0, 0.0]).collect();
+        let rays = constant(&[1, height, width, 4], rays);
+        let points = &(&v[1] * &rays) + &constant(&[4], vec![0.0, 0.0, 0.0, 1.0]);
+        let seen = points.reshape([batch, height * width, 4]).matmul(&v[2].permute(&[0, 2, 1]));
+        let seen = seen.reshape([batch * height * width, 3]);
+        let numerators = seen.matmul(&constant(&[3, 2], vec![fx, 0.0, 0.0, fy, cx, cy]));
+        let z = seen.matmul(&constant(&[3, 1], vec![0.0, 0.0, 1.0])).affine(1.0, EPSILON);
+        let last = constant(&[2], vec![(width - 1) as f64, (height - 1) as f64]);
+        let grid = (&(&numerators / &z) / &last).affine(2.0, -1.0).reshape([batch, height, width, 2]);
+        v[0].grid_sample(&grid, GridPadding::Border, false)
+    }
+
+    #[test]
+    fn it_agrees_with_the_composition_of_plain_ops() {
+        let camera = [10.0, 9.0, 8.3, 3.9];
+        let mut random = Random::new(3, 1);
+        let mut transform = uniform(&mut random, [2, 3, 4], -0.3, 0.3);
+        for b in 0..2 {
+            (0..3).for_each(|i| transform.data_mut()[b * 12 + i * 5] += 1.0);
+        }
+        let source = uniform(&mut random, [2, 8, 17, 3], 0.0, 1.0);
+        let inputs = [source, uniform(&mut random, [2, 8, 17, 1], 1.0, 9.0), transform];
+        let cotangent = uniform(&mut random, [2, 8, 17, 3], -1.0, 1.0);
+        let run = |f: &dyn Fn(&[Var<f64>]) -> Var<f64>| {
+            let tape = Tape::new();
+            let v: Vec<_> = inputs.iter().map(|x| tape.leaf(x.clone())).collect();
+            let y = f(&v);
+            let mut gradients = tape.backward(&[(&y, cotangent.clone())]);
+            let mut all: Vec<_> = v.iter().map(|v| gradients.take(v).unwrap()).collect();
+            all.push(y.into_value());
+            all
+        };
+        let fused = run(&|v| v[0].warp(&v[1], &v[2], &[camera; 2], false));
+        for (a, b) in fused.iter().zip(run(&|v| composed(v, camera))) {
+            let scale = b.data().iter().fold(0.0, |m: f64, x| m.max(x.abs()));
+            assert!(a.data().iter().zip(b.data()).all(|(a, b)| (a - b).abs() < 1e-11 * scale));
+        }
+    }
+
+    #[test]
+    fn standing_still_gives_the_source_back_on_the_consistent_grid() {
+        let mut random = Random::new(4, 1);
+        let source = Var::constant(uniform(&mut random, [1, 5, 7, 3], 0.0, 1.0));
+        let depth = Var::constant(uniform(&mut random, [1, 5, 7, 1], 1.0, 9.0));
+        let still = vec![1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0];
+        let still = Var::constant(Tensor::from_vec([1, 3, 4], still));
+        let y = source.warp(&depth, &still, &[[5.0, 6.0, 3.5, 2.5]], true);
+        assert!(y.value().data().iter().zip(source.value().data()).all(|(a, b)| (a - b).abs() < 1e-6));
+    }
+
+    #[test]
+    fn any_depth_and_any_transform_are_safe() {
+        let wild = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1e300, -1e300, 0.0, -0.0, -1e-7, 1e-300];
+        for &t in &wild {
+            for &d in &wild {
+                let tape = Tape::new();
+                let depth = tape.leaf(Tensor::full([1, 3, 4, 1], d));
+                let mut transform = Tensor::full([1, 3, 4], t);
+                transform.data_mut()[0] = 1.0;
+                let transform = tape.leaf(transform);
+                let source = tape.leaf(Tensor::full([1, 3, 4, 3], 1.0));
+                let y = source.warp(&depth, &transform, &[[2.0, 2.0, 1.5, 1.0]], false);
+                assert!(y.value().data().iter().all(|y| y.is_nan() || (y - 1.0).abs() < 1e-12));
+                y.sum_all().backward();
+            }
+        }
+    }
+}
