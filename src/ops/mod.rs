@@ -11,6 +11,7 @@ pub mod trace;
 
 pub mod batch_norm;
 pub mod binary;
+pub mod conv_relative_position;
 pub mod factorised_attention;
 pub mod layer_norm;
 pub mod linear;

@@ -52,6 +52,7 @@ registry! {
     "layer_norm" => layer_norm::LayerNorm,
     "softmax" => softmax::Softmax,
     "factorised_attention" => factorised_attention::FactorisedAttention,
+    "conv_relative_position" => conv_relative_position::ConvRelativePosition,
 }
 
 /// One op as the suite sees it.
