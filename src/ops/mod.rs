@@ -16,6 +16,7 @@ pub mod conv2d;
 pub mod conv_relative_position;
 pub mod depthwise_conv2d;
 pub mod disparity_to_depth;
+pub mod conv_relative_position;
 pub mod factorised_attention;
 pub mod grid_sample;
 pub mod layer_norm;

@@ -74,6 +74,7 @@ registry! {
     "smoothness" => smoothness::Smoothness,
     "min_reprojection" => min_reprojection::MinReprojection,
     "disparity_to_depth" => unary::Unary<disparity_to_depth::DisparityToDepth>,
+    "conv_relative_position" => conv_relative_position::ConvRelativePosition,
 }
 
 /// One op as the suite sees it.
