@@ -69,12 +69,7 @@ registry! {
     "min_reprojection" => min_reprojection::MinReprojection,
     "pose_matrix" => pose::PoseMatrix,
     "conv_relative_position" => conv_relative_position::ConvRelativePosition,
-    "ssim_loss" => ssim::SsimLoss,
-    "photometric" => photometric::Photometric,
-    "smoothness" => smoothness::Smoothness,
-    "min_reprojection" => min_reprojection::MinReprojection,
     "disparity_to_depth" => unary::Unary<disparity_to_depth::DisparityToDepth>,
-    "conv_relative_position" => conv_relative_position::ConvRelativePosition,
 }
 
 /// One op as the suite sees it.
