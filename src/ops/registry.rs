@@ -49,6 +49,10 @@ registry! {
     "linear" => linear::Linear,
     "concat" => concat::Concat,
     "depthwise_conv2d" => depthwise_conv2d::DepthwiseConv2d,
+    "max_pool2d" => pool2d::MaxPool2d,
+    "avg_pool2d" => pool2d::AvgPool2d,
+    "resize_bilinear" => resize_bilinear::ResizeBilinear,
+    "reflect_pad" => reflect_pad::ReflectPad,
     "slice" => slice::Slice,
     "upsample_nearest" => upsample_nearest::UpsampleNearest,
 }
