@@ -53,6 +53,7 @@ registry! {
     "max_pool2d" => pool2d::MaxPool2d,
     "avg_pool2d" => pool2d::AvgPool2d,
     "resize_bilinear" => resize_bilinear::ResizeBilinear,
+    "reflect_pad" => reflect_pad::ReflectPad,
     "slice" => slice::Slice,
     "upsample_nearest" => upsample_nearest::UpsampleNearest,
     "batch_norm" => batch_norm::BatchNorm,

@@ -6,6 +6,7 @@ use std::ops::{Add, AddAssign, Div, DivAssign, Mul, MulAssign, Neg, Sub, SubAssi
 
 use super::gemm::Gemm;
 use super::pool::Pool;
+use super::simd::Vector;
 
 mod sealed {
     pub trait Sealed {}
@@ -19,6 +20,7 @@ mod sealed {
 pub trait Float:
     sealed::Sealed
     + Gemm
+    + Vector
     + Copy
     + Debug
     + Display

@@ -1,13 +1,15 @@
 //! The kernels: convolution of each channel with its own window, over channels that lie side by side.
 //!
 //! They work on [`Rows`], one row a pixel, so that a range of channels of a wider tensor (the values among queries, keys
-//! and values) is convolved where it lies. Channels go in blocks of 16 or 8 that stay in registers; where the count is no
-//! multiple, the last block overlaps the one before and only its new channels are written.
+//! and values) is convolved where it lies. Channels go in blocks of one vector register, the last one perhaps in part.
+
+use pulp::{Simd, WithSimd};
 
 use crate::ops::linear::sum_into;
 use crate::tensor::gemm::{Rows, RowsMut};
 use crate::tensor::pool::Buffer;
-use crate::tensor::{Accum, Float, Tensor, parallel, simd};
+use crate::tensor::simd::dispatch_vector;
+use crate::tensor::{Accum, Float, Tensor, parallel};
 
 /// The images and the window that is moved over them. Pixels outside the image are 0.
 #[derive(Clone, Copy, Debug)]
@@ -57,16 +59,12 @@ impl Window {
     }
 }
 
-/// Lanes of the widest block.
-const WIDE: usize = 16;
-/// Lanes of the narrower one.
-const NARROW: usize = 8;
-/// Neighbouring outputs computed together, which share the pixels that they read.
+/// Neighbouring outputs computed together, which share the weights and most of the pixels that they read.
 const TILE: usize = 4;
 
-/// Rows of pixels handed to a thread at a time: about 2^16 multiplications.
+/// Rows of pixels handed to a thread at a time: about 2^17 multiplications.
 fn band(row: usize) -> usize {
-    ((1 << 16) / row.max(1)).clamp(1, 64)
+    ((1 << 17) / row.max(1)).clamp(1, 64)
 }
 
 /// `y = bias + w * x` (cross-correlation) or `y += ...`: x has `batch * height * width` rows, w `kernel` rows, all with
@@ -82,7 +80,7 @@ pub(crate) fn forward<T: Float>(
     accum: Accum,
     tile: usize,
 ) {
-    let (window, [height, width], c) = (*window, window.out(), x.cols);
+    let ([height, width], c, stride) = (window.out(), x.cols, y.row_stride);
     let taps = window.kernel[0] * window.kernel[1];
     assert!(x.rows == window.pixels() && y.rows == window.batch * height * width, "depthwise: rows of the images");
     assert!(y.cols == c && w.len() == taps * c && bias.is_none_or(|b| b.len() == c), "depthwise: {c} channels");
@@ -91,122 +89,169 @@ pub(crate) fn forward<T: Float>(
     }
     let zeros = Buffer::filled(if bias.is_some() { 0 } else { c }, T::ZERO);
     let bias = bias.unwrap_or(&zeros);
-    let row = width * y.row_stride;
     let tile = if tile > 0 { tile } else { band(width * c * taps) };
-    parallel::for_each_chunk(y.data, tile * row, 2 * y.rows * c * taps, |i, y| {
-        simd::dispatch(
-            #[inline(always)]
-            || {
-                for (j, out) in y.chunks_mut(row).enumerate() {
-                    let at = i * tile + j;
-                    let line = Line { window, x, w, bias, image: at / height, row: at % height };
-                    match c {
-                        WIDE.. => line.convolve::<WIDE>(out, y_stride(row, width), accum),
-                        NARROW.. => line.convolve::<NARROW>(out, y_stride(row, width), accum),
-                        _ => line.convolve::<1>(out, y_stride(row, width), accum),
-                    }
-                }
-            },
-        );
+    parallel::for_each_chunk(y.data, tile * width * stride, 2 * y.rows * c * taps, |i, out| {
+        let pass = Pass { window: *window, height, width, first_row: i * tile, w };
+        dispatch_vector(Convolve { pass, x, bias, out, stride, accum });
     });
 }
 
-#[inline(always)]
-fn y_stride(row: usize, width: usize) -> usize {
-    row / width
+/// What the three kernels share: the window, the extents of the output, the row they begin at, and the weight.
+#[derive(Clone, Copy)]
+struct Pass<'a, T> {
+    window: Window,
+    height: usize,
+    width: usize,
+    first_row: usize,
+    w: &'a [T],
+}
+
+/// Some rows of the output.
+struct Convolve<'a, T> {
+    pass: Pass<'a, T>,
+    x: Rows<'a, T>,
+    bias: &'a [T],
+    out: &'a mut [T],
+    stride: usize,
+    accum: Accum,
+}
+
+impl<T: Float> WithSimd for Convolve<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Convolve { pass, x, bias, out, stride, accum } = self;
+        for (i, out) in out.chunks_mut(pass.width * stride).enumerate() {
+            let at = pass.first_row + i;
+            let line = Line { pass, x, bias, image: at / pass.height, row: at % pass.height, stride, accum };
+            let full = x.cols / T::lanes::<S>() * T::lanes::<S>();
+            for first in (0..full).step_by(T::lanes::<S>()) {
+                line.block(simd, Block::<false> { first, end: first + T::lanes::<S>() }, out);
+            }
+            if full < x.cols {
+                line.block(simd, Block::<true> { first: full, end: x.cols }, out);
+            }
+        }
+    }
+}
+
+/// A block of channels: those of a vector, or (`PART`) fewer.
+#[derive(Clone, Copy)]
+struct Block<const PART: bool> {
+    first: usize,
+    end: usize,
+}
+
+impl<const PART: bool> Block<PART> {
+    /// The block of the pixel or tap that begins at `at`.
+    #[inline(always)]
+    fn load<T: Float, S: Simd>(self, simd: S, x: &[T], at: usize) -> T::V<S> {
+        let x = &x[at + self.first..at + self.end];
+        if PART { T::load_part(simd, x) } else { T::load(simd, x) }
+    }
+
+    #[inline(always)]
+    fn store<T: Float, S: Simd>(self, simd: S, out: &mut [T], at: usize, v: T::V<S>, accum: Accum) {
+        let v = match accum {
+            Accum::Replace => v,
+            Accum::Add => T::vector_add(simd, self.load(simd, out, at), v),
+        };
+        let out = &mut out[at + self.first..at + self.end];
+        if PART { T::store_part(simd, out, v) } else { T::store(simd, out, v) }
+    }
 }
 
 /// One row of the output of one image.
 #[derive(Clone, Copy)]
 struct Line<'a, T> {
-    window: Window,
+    pass: Pass<'a, T>,
     x: Rows<'a, T>,
-    w: &'a [T],
     bias: &'a [T],
     image: usize,
     row: usize,
+    stride: usize,
+    accum: Accum,
 }
 
 impl<T: Float> Line<'_, T> {
-    /// Computes the row, block by block.
+    /// One block of channels of the row.
     #[inline(always)]
-    fn convolve<const L: usize>(&self, out: &mut [T], stride: usize, accum: Accum) {
-        for (first, skip) in blocks::<L>(self.x.cols) {
-            match (L, self.window.kernel, self.window.stride) {
-                (WIDE | NARROW, [3, 3], 1) => self.block::<L, 3, 1>(first, skip, out, stride, accum),
-                (WIDE | NARROW, [3, 3], 2) => self.block::<L, 3, 2>(first, skip, out, stride, accum),
-                (WIDE | NARROW, [5, 5], 1) => self.block::<L, 5, 1>(first, skip, out, stride, accum),
-                (WIDE | NARROW, [7, 7], 1) => self.block::<L, 7, 1>(first, skip, out, stride, accum),
-                _ => {
-                    for (ox, out) in out.chunks_mut(stride).enumerate() {
-                        store(&mut out[first..], skip, &self.pixel::<L>(ox, first), accum);
-                    }
-                }
-            }
+    fn block<S: Simd, const PART: bool>(&self, simd: S, block: Block<PART>, out: &mut [T]) {
+        match (self.pass.window.kernel, self.pass.window.stride) {
+            ([3, 3], 1) => self.tiles::<S, PART, 3, 1>(simd, block, out),
+            ([3, 3], 2) => self.tiles::<S, PART, 3, 2>(simd, block, out),
+            ([5, 5], 1) => self.tiles::<S, PART, 5, 1>(simd, block, out),
+            ([7, 7], 1) => self.tiles::<S, PART, 7, 1>(simd, block, out),
+            _ => self.singles(simd, block, out, 0, self.pass.width),
         }
     }
 
-    /// One block of channels of the row, for a window of known size: tiles of outputs, and single ones at the edges.
+    /// The row for a window of known size: tiles of outputs, and single ones at the edges.
     #[inline(always)]
-    fn block<const L: usize, const K: usize, const S: usize>(
+    fn tiles<S: Simd, const PART: bool, const K: usize, const STRIDE: usize>(
         &self,
-        first: usize,
-        skip: usize,
+        simd: S,
+        block: Block<PART>,
         out: &mut [T],
-        stride: usize,
-        accum: Accum,
     ) {
-        let width = out.len().div_ceil(stride);
-        let (from, to) = self.window.interior(width);
+        let width = self.pass.width;
+        let (from, to) = self.pass.window.interior(width);
         let tiled = from + (to - from) / TILE * TILE;
+        self.singles(simd, block, out, 0, from);
         for ox in (from..tiled).step_by(TILE) {
-            let sums = self.tile::<L, K, S>(ox, first);
-            for (p, sums) in sums.iter().enumerate() {
-                store(&mut out[(ox + p) * stride + first..], skip, sums, accum);
+            let sums = self.tile::<S, PART, K, STRIDE>(simd, block, ox);
+            for (p, &sum) in sums.iter().enumerate() {
+                block.store(simd, out, (ox + p) * self.stride, sum, self.accum);
             }
         }
-        for ox in (0..from).chain(tiled..width) {
-            store(&mut out[ox * stride + first..], skip, &self.pixel::<L>(ox, first), accum);
-        }
+        self.singles(simd, block, out, tiled, width);
     }
 
     /// [`TILE`] neighbouring outputs whose windows lie inside the image.
     #[inline(always)]
-    fn tile<const L: usize, const K: usize, const S: usize>(&self, ox: usize, first: usize) -> [[T; L]; TILE] {
-        let Window { height, width, padding, .. } = self.window;
+    fn tile<S: Simd, const PART: bool, const K: usize, const STRIDE: usize>(
+        &self,
+        simd: S,
+        block: Block<PART>,
+        ox: usize,
+    ) -> [T::V<S>; TILE] {
+        let Window { height, width, padding, .. } = self.pass.window;
         let (c, step) = (self.x.cols, self.x.row_stride);
-        let (ky_from, ky_to) = self.window.taps(self.row, height, K);
-        let mut sums = [*load::<T, L>(self.bias, first); TILE];
+        let (ky_from, ky_to) = self.pass.window.taps(self.row, height, K);
+        let mut sums = [block.load(simd, self.bias, 0); TILE];
         for ky in ky_from..ky_to {
-            let pixel = (self.image * height + self.row * S + ky - padding) * width + ox * S - padding;
-            let x = &self.x.data[pixel * step + first..];
-            let w = &self.w[ky * K * c + first..];
+            let pixel = (self.image * height + self.row * STRIDE + ky - padding) * width + ox * STRIDE - padding;
+            let x = &self.x.data[pixel * step..];
+            let w = &self.pass.w[ky * K * c..(ky + 1) * K * c];
             for kx in 0..K {
-                let w = load::<T, L>(w, kx * c);
+                let w = block.load(simd, w, kx * c);
                 for (p, sum) in sums.iter_mut().enumerate() {
-                    fma(sum, load(x, (p * S + kx) * step), w);
+                    *sum = T::fma(simd, block.load(simd, x, (p * STRIDE + kx) * step), w, *sum);
                 }
             }
         }
         sums
     }
 
-    /// One output, with only those taps that meet the image.
+    /// Outputs one by one, each with only those taps that meet the image.
     #[inline(always)]
-    fn pixel<const L: usize>(&self, ox: usize, first: usize) -> [T; L] {
-        let Window { height, width, padding, stride, kernel: [kh, kw], .. } = self.window;
+    fn singles<S: Simd, const PART: bool>(&self, simd: S, block: Block<PART>, out: &mut [T], from: usize, to: usize) {
+        let Window { height, width, padding, stride, kernel: [kh, kw], .. } = self.pass.window;
         let (c, step) = (self.x.cols, self.x.row_stride);
-        let (ky_from, ky_to) = self.window.taps(self.row, height, kh);
-        let (kx_from, kx_to) = self.window.taps(ox, width, kw);
-        let mut sum = *load::<T, L>(self.bias, first);
-        for ky in ky_from..ky_to {
-            let row = (self.image * height + self.row * stride + ky - padding) * width;
-            for kx in kx_from..kx_to {
-                let x = load(self.x.data, (row + ox * stride + kx - padding) * step + first);
-                fma(&mut sum, x, load(self.w, (ky * kw + kx) * c + first));
+        let (ky_from, ky_to) = self.pass.window.taps(self.row, height, kh);
+        for ox in from..to {
+            let (kx_from, kx_to) = self.pass.window.taps(ox, width, kw);
+            let mut sum = block.load(simd, self.bias, 0);
+            for ky in ky_from..ky_to {
+                let row = (self.image * height + self.row * stride + ky - padding) * width;
+                for kx in kx_from..kx_to {
+                    let x = block.load(simd, self.x.data, (row + ox * stride + kx - padding) * step);
+                    sum = T::fma(simd, x, block.load(simd, self.pass.w, (ky * kw + kx) * c), sum);
+                }
             }
+            block.store(simd, out, ox * self.stride, sum, self.accum);
         }
-        sum
     }
 }
 
@@ -221,7 +266,7 @@ pub(crate) fn input_gradient<T: Float>(
     accum: Accum,
     tile: usize,
 ) {
-    let (window, [height, width], c) = (*window, window.out(), g.cols);
+    let ([height, width], c, stride) = (window.out(), g.cols, dx.row_stride);
     let [kh, kw] = window.kernel;
     assert!(g.rows == window.batch * height * width && dx.rows == window.pixels(), "depthwise: rows of the images");
     assert!(dx.cols == c && w.len() == kh * kw * c, "depthwise: {c} channels");
@@ -234,67 +279,89 @@ pub(crate) fn input_gradient<T: Float>(
         for (to, from) in turned.chunks_exact_mut(c).zip(w.chunks_exact(c).rev()) {
             to.copy_from_slice(from);
         }
-        let window = Window { height, width, padding: kh - 1 - window.padding, ..window };
+        let window = Window { height, width, padding: kh - 1 - window.padding, ..*window };
         return forward(&window, g, &turned, None, dx, accum, tile);
     }
-    let (stride, row) = (dx.row_stride, window.width * dx.row_stride);
     let tile = if tile > 0 { tile } else { band(window.width * c * kh * kw) };
-    parallel::for_each_chunk(dx.data, tile * row, 2 * g.rows * c * kh * kw, |i, dx| {
-        simd::dispatch(
-            #[inline(always)]
-            || {
-                for (j, out) in dx.chunks_mut(row).enumerate() {
-                    let at = i * tile + j;
-                    match c {
-                        WIDE.. => gather_row::<T, WIDE>(&window, [height, width], at, g, w, out, stride, accum),
-                        NARROW.. => gather_row::<T, NARROW>(&window, [height, width], at, g, w, out, stride, accum),
-                        _ => gather_row::<T, 1>(&window, [height, width], at, g, w, out, stride, accum),
-                    }
-                }
-            },
-        );
+    parallel::for_each_chunk(dx.data, tile * window.width * stride, 2 * g.rows * c * kh * kw, |i, out| {
+        let pass = Pass { window: *window, height, width, first_row: i * tile, w };
+        dispatch_vector(Gather { pass, g, out, stride, accum });
     });
 }
 
-/// A row of the input's gradient: each pixel gathers from the outputs whose windows met it.
-#[inline(always)]
-#[expect(clippy::too_many_arguments, reason = "the parts of one loop nest")]
-fn gather_row<T: Float, const L: usize>(
-    window: &Window,
-    [height, width]: [usize; 2],
-    at: usize,
-    g: Rows<T>,
-    w: &[T],
-    out: &mut [T],
+/// Some rows of the input's gradient: each pixel gathers from the outputs whose windows met it.
+struct Gather<'a, T> {
+    pass: Pass<'a, T>,
+    g: Rows<'a, T>,
+    out: &'a mut [T],
     stride: usize,
     accum: Accum,
-) {
-    let Window { padding, stride: s, kernel: [kh, kw], .. } = *window;
-    let (image, c) = (at / window.height, g.cols);
-    let y = at % window.height + padding;
-    for (ix, out) in out.chunks_mut(stride).enumerate() {
-        let x = ix + padding;
-        // The taps that meet this pixel are every s-th: tap k of output o reads pixel o s + k - padding.
-        let (last_x, first_kx) = (x / s, x % s);
-        let (last_y, first_ky) = (y / s, y % s);
-        for (first, skip) in blocks::<L>(c) {
-            let mut sum = [T::ZERO; L];
-            for (back, ky) in (first_ky..kh).step_by(s).enumerate().take(last_y + 1) {
-                let oy = last_y - back;
-                if oy >= height {
-                    continue;
+}
+
+impl<T: Float> WithSimd for Gather<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Gather { pass, g, out, stride, accum } = self;
+        let (lanes, c, window) = (T::lanes::<S>(), g.cols, pass.window);
+        let full = c / lanes * lanes;
+        for (i, out) in out.chunks_mut(window.width * stride).enumerate() {
+            let at = pass.first_row + i;
+            let (image, y) = (at / window.height, at % window.height + window.padding);
+            for (ix, out) in out.chunks_mut(stride).enumerate() {
+                let x = ix + window.padding;
+                for first in (0..full).step_by(lanes) {
+                    let block = Block::<false> { first, end: first + lanes };
+                    block.store(simd, out, 0, pass.gather(simd, block, g, [image, y, x]), accum);
                 }
-                let row = (image * height + oy) * width;
-                for (back, kx) in (first_kx..kw).step_by(s).enumerate().take(last_x + 1) {
-                    let ox = last_x - back;
-                    if ox < width {
-                        let g = load(g.data, (row + ox) * g.row_stride + first);
-                        fma(&mut sum, g, load(w, (ky * kw + kx) * c + first));
-                    }
+                if full < c {
+                    let block = Block::<true> { first: full, end: c };
+                    block.store(simd, out, 0, pass.gather(simd, block, g, [image, y, x]), accum);
                 }
             }
-            store(&mut out[first..], skip, &sum, accum);
         }
+    }
+}
+
+impl<T: Float> Pass<'_, T> {
+    /// The gradient of pixel (y, x), counted with the padding. Tap k of output o reads pixel o stride + k: every
+    /// stride-th tap meets this one.
+    #[inline(always)]
+    fn gather<S: Simd, const PART: bool>(
+        &self,
+        simd: S,
+        block: Block<PART>,
+        g: Rows<T>,
+        [image, y, x]: [usize; 3],
+    ) -> T::V<S> {
+        let Window { stride, kernel: [kh, kw], .. } = self.window;
+        // The division by a stride of 2 must not cost one.
+        let (oy, ox, ky, kx) = match stride {
+            2 => (y / 2, x / 2, y % 2, x % 2),
+            s => (y / s, x / s, y % s, x % s),
+        };
+        let mut sum = T::splat(simd, T::ZERO);
+        let mut row = oy;
+        let mut ky = ky;
+        while ky < kh {
+            if row < self.height {
+                let (mut column, mut kx) = (ox, kx);
+                while kx < kw {
+                    if column < self.width {
+                        let at = (image * self.height + row) * self.width + column;
+                        let d = block.load(simd, g.data, at * g.row_stride);
+                        sum = T::fma(simd, d, block.load(simd, self.w, (ky * kw + kx) * g.cols), sum);
+                    }
+                    // Below 0 this wraps to beyond the width, and stays out.
+                    column = column.wrapping_sub(1);
+                    kx += stride;
+                }
+            }
+            row = row.wrapping_sub(1);
+            ky += stride;
+        }
+        sum
     }
 }
 
@@ -310,7 +377,7 @@ pub(crate) fn weight_gradient<T: Float>(
     accum: Accum,
     tile: usize,
 ) {
-    let (window, [height, width], c) = (*window, window.out(), g.cols);
+    let ([height, width], c) = (window.out(), g.cols);
     let [kh, kw] = window.kernel;
     assert!(x.rows == window.pixels() && g.rows == window.batch * height * width, "depthwise: rows of the images");
     assert!(x.cols == c && dw.len() == kh * kw * c, "depthwise: {c} channels");
@@ -318,136 +385,133 @@ pub(crate) fn weight_gradient<T: Float>(
         return;
     }
     let rows = window.batch * height;
-    let tile = if tile > 0 { tile } else { rows.div_ceil(16).max(band(width * c * kh * kw) / 2).max(1) };
+    let tile = if tile > 0 { tile } else { rows.div_ceil(16).max(band(width * c * kh * kw) / 4).max(1) };
     let sums = parallel::map(rows.div_ceil(tile), 2 * g.rows * c * kh * kw, |i| {
         Tensor::build([kh * kw, c], |dw| {
             dw.fill(T::ZERO);
-            simd::dispatch(
-                #[inline(always)]
-                || {
-                    for at in i * tile..((i + 1) * tile).min(rows) {
-                        match c {
-                            WIDE.. => weight_row::<T, WIDE>(&window, [height, width], at, x, g, dw),
-                            NARROW.. => weight_row::<T, NARROW>(&window, [height, width], at, x, g, dw),
-                            _ => weight_row::<T, 1>(&window, [height, width], at, x, g, dw),
-                        }
-                    }
-                },
-            );
+            let pass = Pass { window: *window, height, width, first_row: i * tile, w: &[] };
+            dispatch_vector(Weigh { pass, rows: tile.min(rows - i * tile), x, g, dw });
         })
     });
     sum_into(dw, accum, &sums);
 }
 
-/// What one row of the output adds to the weight's gradient.
-#[inline(always)]
-fn weight_row<T: Float, const L: usize>(
-    window: &Window,
-    [height, width]: [usize; 2],
-    at: usize,
-    x: Rows<T>,
-    g: Rows<T>,
-    dw: &mut [T],
-) {
-    let (image, row) = (at / height, at % height);
-    let [kh, kw] = window.kernel;
-    let (ky_from, ky_to) = window.taps(row, window.height, kh);
-    let g = &g.data[at * width * g.row_stride..].chunks(g.row_stride);
-    for (first, skip) in blocks::<L>(x.cols) {
-        for ky in ky_from..ky_to {
-            let pixel = (image * window.height + row * window.stride + ky - window.padding) * window.width;
-            let x = Rows { data: &x.data[pixel * x.row_stride + first..], ..x };
-            let dw = &mut dw[ky * kw * x.cols + first..];
-            let g = g.clone().take(width).map(|g| load::<T, L>(g, first));
-            match (L, kw, window.stride) {
-                (WIDE | NARROW, 3, 1) => weight_taps::<T, L, 3, 1>(window, width, x, g, skip, dw),
-                (WIDE | NARROW, 3, 2) => weight_taps::<T, L, 3, 2>(window, width, x, g, skip, dw),
-                (WIDE | NARROW, 5, 1) => weight_taps::<T, L, 5, 1>(window, width, x, g, skip, dw),
-                (WIDE | NARROW, 7, 1) => weight_taps::<T, L, 7, 1>(window, width, x, g, skip, dw),
-                _ => g.enumerate().for_each(|(ox, g)| weight_pixel(window, ox, x, g, skip, dw)),
+/// What some rows of the output add to the weight's gradient.
+struct Weigh<'a, T> {
+    pass: Pass<'a, T>,
+    rows: usize,
+    x: Rows<'a, T>,
+    g: Rows<'a, T>,
+    dw: &'a mut [T],
+}
+
+impl<T: Float> WithSimd for Weigh<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(mut self, simd: S) {
+        let (lanes, c) = (T::lanes::<S>(), self.x.cols);
+        let full = c / lanes * lanes;
+        for at in self.pass.first_row..self.pass.first_row + self.rows {
+            for first in (0..full).step_by(lanes) {
+                self.row(simd, Block::<false> { first, end: first + lanes }, at);
+            }
+            if full < c {
+                self.row(simd, Block::<true> { first: full, end: c }, at);
             }
         }
     }
 }
 
-/// A row of taps over a row of the output: one sum in registers for each tap.
-#[inline(always)]
-fn weight_taps<'a, T: Float, const L: usize, const K: usize, const S: usize>(
-    window: &Window,
-    width: usize,
-    x: Rows<T>,
-    g: impl Iterator<Item = &'a [T; L]>,
-    skip: usize,
-    dw: &mut [T],
-) {
-    let (from, to) = window.interior(width);
-    let mut sums = [[T::ZERO; L]; K];
-    let mut g = g.enumerate();
-    for (ox, g) in g.by_ref().take(from) {
-        weight_pixel(window, ox, x, g, skip, dw);
-    }
-    for (ox, g) in g.by_ref().take(to - from) {
-        let x_row = &x.data[(ox * S - window.padding) * x.row_stride..];
-        for (kx, sum) in sums.iter_mut().enumerate() {
-            fma(sum, load(x_row, kx * x.row_stride), g);
+impl<T: Float> Weigh<'_, T> {
+    /// One block of channels of one row.
+    #[inline(always)]
+    fn row<S: Simd, const PART: bool>(&mut self, simd: S, block: Block<PART>, at: usize) {
+        let Window { stride, kernel: [kh, kw], height, width, padding, .. } = self.pass.window;
+        let (image, row) = (at / self.pass.height, at % self.pass.height);
+        let (ky_from, ky_to) = self.pass.window.taps(row, height, kh);
+        let line = |ky: usize| (image * height + row * stride + ky - padding) * width;
+        if ([kh, kw], ky_from, ky_to) == ([3, 3], 0, 3) {
+            // All nine taps at once: three sums alone would wait for one another.
+            let lines = [line(0), line(1), line(2)];
+            return match stride {
+                1 => self.taps::<S, PART, 3, 3, 1>(simd, block, at, 0, lines),
+                2 => self.taps::<S, PART, 3, 3, 2>(simd, block, at, 0, lines),
+                _ => lines.into_iter().enumerate().for_each(|(ky, line)| {
+                    self.singles(simd, block, at, ky, line, 0, self.pass.width);
+                }),
+            };
+        }
+        for ky in ky_from..ky_to {
+            match (kw, stride) {
+                (3, 1) => self.taps::<S, PART, 1, 3, 1>(simd, block, at, ky, [line(ky)]),
+                (3, 2) => self.taps::<S, PART, 1, 3, 2>(simd, block, at, ky, [line(ky)]),
+                (5, 1) => self.taps::<S, PART, 1, 5, 1>(simd, block, at, ky, [line(ky)]),
+                (7, 1) => self.taps::<S, PART, 1, 7, 1>(simd, block, at, ky, [line(ky)]),
+                _ => self.singles(simd, block, at, ky, line(ky), 0, self.pass.width),
+            }
         }
     }
-    for (ox, g) in g {
-        weight_pixel(window, ox, x, g, skip, dw);
+
+    /// `R` rows of taps from `ky` on over a row of the output, one sum in a register for each tap; `lines` are the
+    /// first pixels of the rows of x that they meet.
+    #[inline(always)]
+    fn taps<S: Simd, const PART: bool, const R: usize, const K: usize, const STRIDE: usize>(
+        &mut self,
+        simd: S,
+        block: Block<PART>,
+        at: usize,
+        ky: usize,
+        lines: [usize; R],
+    ) {
+        let (c, step, width, padding) = (self.x.cols, self.x.row_stride, self.pass.width, self.pass.window.padding);
+        let (from, to) = self.pass.window.interior(width);
+        let mut sums = [[T::splat(simd, T::ZERO); K]; R];
+        for ox in from..to {
+            let g = block.load(simd, self.g.data, (at * width + ox) * self.g.row_stride);
+            for (sums, line) in sums.iter_mut().zip(lines) {
+                let x = &self.x.data[(line + ox * STRIDE - padding) * step..];
+                for (kx, sum) in sums.iter_mut().enumerate() {
+                    *sum = T::fma(simd, block.load(simd, x, kx * step), g, *sum);
+                }
+            }
+        }
+        for (r, sums) in sums.iter().enumerate() {
+            for (kx, &sum) in sums.iter().enumerate() {
+                block.store(simd, self.dw, ((ky + r) * K + kx) * c, sum, Accum::Add);
+            }
+        }
+        for (r, line) in lines.into_iter().enumerate() {
+            self.singles(simd, block, at, ky + r, line, 0, from);
+            self.singles(simd, block, at, ky + r, line, to, width);
+        }
     }
-    for (kx, sum) in sums.iter().enumerate() {
-        store(&mut dw[kx * x.cols..], skip, sum, Accum::Add);
-    }
-}
 
-/// A row of taps at one position of the window, those that meet the image.
-#[inline(always)]
-fn weight_pixel<T: Float, const L: usize>(
-    window: &Window,
-    ox: usize,
-    x: Rows<T>,
-    g: &[T; L],
-    skip: usize,
-    dw: &mut [T],
-) {
-    let (from, to) = window.taps(ox, window.width, window.kernel[1]);
-    for kx in from..to {
-        let x_at = load::<T, L>(x.data, (ox * window.stride + kx - window.padding) * x.row_stride);
-        let dw = &mut dw[kx * x.cols..][..L];
-        dw.iter_mut().zip(x_at.iter().zip(g)).skip(skip).for_each(|(d, (&x, &g))| *d = x.mul_add(g, *d));
-    }
-}
-
-/// The first channel of each block, and how many of its channels the block before has done already.
-#[inline(always)]
-fn blocks<const L: usize>(c: usize) -> impl Iterator<Item = (usize, usize)> {
-    (0..c).step_by(L).map(move |from| {
-        let first = from.min(c - L);
-        (first, from - first)
-    })
-}
-
-#[inline(always)]
-fn load<T, const L: usize>(x: &[T], at: usize) -> &[T; L] {
-    x[at..].first_chunk().expect("a block of channels")
-}
-
-#[inline(always)]
-fn fma<T: Float, const L: usize>(sum: &mut [T; L], a: &[T; L], b: &[T; L]) {
-    for ((s, &a), &b) in sum.iter_mut().zip(a).zip(b) {
-        *s = a.mul_add(b, *s);
-    }
-}
-
-/// Writes a block but for its first `skip` channels.
-#[inline(always)]
-fn store<T: Float, const L: usize>(out: &mut [T], skip: usize, block: &[T; L], accum: Accum) {
-    let out: &mut [T; L] = out.first_chunk_mut().expect("a block of channels");
-    match (accum, skip) {
-        (Accum::Replace, 0) => *out = *block,
-        (Accum::Add, 0) => out.iter_mut().zip(block).for_each(|(o, &b)| *o += b),
-        (Accum::Replace, _) => out.iter_mut().zip(block).skip(skip).for_each(|(o, &b)| *o = b),
-        (Accum::Add, _) => out.iter_mut().zip(block).skip(skip).for_each(|(o, &b)| *o += b),
+    /// A row of taps at single outputs, those taps that meet the image.
+    #[inline(always)]
+    #[expect(clippy::too_many_arguments, reason = "the parts of one loop nest")]
+    fn singles<S: Simd, const PART: bool>(
+        &mut self,
+        simd: S,
+        block: Block<PART>,
+        at: usize,
+        ky: usize,
+        line: usize,
+        from: usize,
+        to: usize,
+    ) {
+        let Window { stride, kernel: [_, kw], width, padding, .. } = self.pass.window;
+        let c = self.x.cols;
+        for ox in from..to {
+            let g = block.load(simd, self.g.data, (at * self.pass.width + ox) * self.g.row_stride);
+            let (kx_from, kx_to) = self.pass.window.taps(ox, width, kw);
+            for kx in kx_from..kx_to {
+                let x = block.load(simd, self.x.data, (line + ox * stride + kx - padding) * self.x.row_stride);
+                let tap = (ky * kw + kx) * c;
+                let sum = T::fma(simd, x, g, block.load(simd, self.dw, tap));
+                block.store(simd, self.dw, tap, sum, Accum::Replace);
+            }
+        }
     }
 }
 
