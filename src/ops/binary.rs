@@ -46,6 +46,7 @@ impl Stretch {
 }
 
 /// Calls `run(result, a, b)` with the offsets of every run along the last dimension.
+#[inline(always)]
 fn for_each_run(shape: &Shape, a: Stretch, b: Stretch, mut run: impl FnMut(usize, usize, usize)) {
     let outer = shape.rank().saturating_sub(1);
     let mut index = [0; MAX_RANK];
@@ -63,6 +64,98 @@ fn for_each_run(shape: &Shape, a: Stretch, b: Stretch, mut run: impl FnMut(usize
             ib -= index[d] * b.0[d];
             index[d] = 0;
         }
+    }
+}
+
+/// A broadcast cut along the first dimension of the result: slices that can be computed side by side.
+struct Slices {
+    /// How many.
+    count: usize,
+    /// The shape of the result in one.
+    shape: Shape,
+    /// Elements of the result in one.
+    result: usize,
+    /// Elements of each operand from one to the next; 0 where it is stretched.
+    operands: [usize; 2],
+    /// How each operand lies in one.
+    strides: [Stretch; 2],
+    /// Elements of a run along the last dimension, and each operand's step in it.
+    run: usize,
+    steps: [usize; 2],
+}
+
+impl Slices {
+    fn of(operands: [&Shape; 2], result: &Shape) -> Self {
+        let strides = operands.map(|o| Stretch::of(o, result));
+        if result.rank() < 2 {
+            let steps = strides.map(|s| s.0[0] * result.rank());
+            let run = result.len();
+            return Slices {
+                count: 1,
+                shape: *result,
+                result: run,
+                operands: operands.map(|o| o.len()),
+                strides,
+                run,
+                steps,
+            };
+        }
+        let shape = result.without(0);
+        let last = shape.rank() - 1;
+        let inner = strides.map(|s| {
+            let mut inner = [0; MAX_RANK];
+            inner[..=last].copy_from_slice(&s.0[1..last + 2]);
+            Stretch(inner)
+        });
+        Slices {
+            count: result.dims()[0],
+            shape,
+            result: shape.len(),
+            operands: strides.map(|s| s.0[0]),
+            strides: inner,
+            run: shape.last(),
+            steps: inner.map(|s| s.0[last]),
+        }
+    }
+
+    /// Adds the gradient of one operand (`side`) in one slice, with its derivative `by(a, b)`.
+    #[inline(always)]
+    #[allow(clippy::too_many_arguments)]
+    fn gradient<T: Float>(
+        &self,
+        side: usize,
+        out: &mut [T],
+        g: &[T],
+        a: &[T],
+        b: &[T],
+        saved: bool,
+        by: impl Fn(T, T) -> T,
+    ) {
+        let n = self.run;
+        for_each_run(&self.shape, self.strides[0], self.strides[1], |io, ia, ib| {
+            let to = [ia, ib][side];
+            let g = &g[io..io + n];
+            // Without saved operands the arguments are not looked at: any slice of the right length will do.
+            let (ia, ib) = if saved { (ia, ib) } else { (0, 0) };
+            let (one_a, one_b) = (a[ia], b[ib]);
+            let (many_a, many_b) = if saved { (&a[ia..], &b[ib..]) } else { (g, g) };
+            if self.steps[side] == 0 {
+                let mut sum = T::ZERO;
+                match self.steps {
+                    [0, 0] => g.iter().for_each(|&g| sum += g * by(one_a, one_b)),
+                    [0, _] => g.iter().zip(many_b).for_each(|(&g, &b)| sum += g * by(one_a, b)),
+                    _ => g.iter().zip(many_a).for_each(|(&g, &a)| sum += g * by(a, one_b)),
+                }
+                out[to] += sum;
+                return;
+            }
+            let terms = out[to..to + n].iter_mut().zip(g);
+            match self.steps {
+                [0, _] => terms.zip(many_b).for_each(|((d, &g), &b)| *d += g * by(one_a, b)),
+                [_, 0] => terms.zip(many_a).for_each(|((d, &g), &a)| *d += g * by(a, one_b)),
+                _ => terms.zip(many_a.iter().zip(many_b)).for_each(|((d, &g), (&a, &b))| *d += g * by(a, b)),
+            }
+        });
     }
 }
 
@@ -102,19 +195,27 @@ where
                 });
                 return;
             }
-            let (sa, sb) = (Stretch::of(a.shape(), &shape), Stretch::of(b.shape(), &shape));
-            let (n, last) = (shape.last(), shape.rank().max(1) - 1);
-            for_each_run(&shape, sa, sb, |io, ia, ib| {
-                let out = &mut out[io..io + n];
-                match (sa.0[last], sb.0[last]) {
-                    (0, 0) => out.fill(F::f(a.data()[ia], b.data()[ib])),
-                    (0, _) => out.iter_mut().zip(&b.data()[ib..]).for_each(|(y, &b)| *y = F::f(a.data()[ia], b)),
-                    (_, 0) => out.iter_mut().zip(&a.data()[ia..]).for_each(|(y, &a)| *y = F::f(a, b.data()[ib])),
-                    _ => {
-                        let operands = a.data()[ia..].iter().zip(&b.data()[ib..]);
-                        out.iter_mut().zip(operands).for_each(|(y, (&a, &b))| *y = F::f(a, b));
-                    }
-                }
+            let slices = Slices::of([a.shape(), b.shape()], &shape);
+            let work = out.len();
+            parallel::for_each_chunk(out, slices.result, work, |i, out| {
+                let (a, b) = (&a.data()[i * slices.operands[0]..], &b.data()[i * slices.operands[1]..]);
+                simd::dispatch(
+                    #[inline(always)]
+                    || {
+                        for_each_run(&slices.shape, slices.strides[0], slices.strides[1], |io, ia, ib| {
+                            let out = &mut out[io..io + slices.run];
+                            match slices.steps {
+                                [0, 0] => out.fill(F::f(a[ia], b[ib])),
+                                [0, _] => out.iter_mut().zip(&b[ib..]).for_each(|(y, &b)| *y = F::f(a[ia], b)),
+                                [_, 0] => out.iter_mut().zip(&a[ia..]).for_each(|(y, &a)| *y = F::f(a, b[ib])),
+                                _ => {
+                                    let operands = a[ia..].iter().zip(&b[ib..]);
+                                    out.iter_mut().zip(operands).for_each(|(y, (&a, &b))| *y = F::f(a, b));
+                                }
+                            }
+                        })
+                    },
+                );
             });
         });
         let saved = (needs.any() && F::SAVES).then(|| [a.clone(), b.clone()]);
@@ -125,10 +226,7 @@ where
     fn backward(&self, (saved, shapes): Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
         let g = upstream.only();
         let operands = saved.as_ref().map(|[a, b]| (a.data(), b.data()));
-        // Functions whose derivatives are constant never look at their arguments.
-        let pair = |ia: usize, ib: usize| operands.map_or((T::ZERO, T::ZERO), |(a, b)| (a[ia], b[ib]));
         for side in [0, 1] {
-            let derivative = if side == 0 { F::da::<T> } else { F::db::<T> };
             if !F::SAVES && shapes[side] == *g.shape() && F::is_identity(side) {
                 sink.give(side, g.clone());
                 continue;
@@ -154,28 +252,27 @@ where
                     });
                     return;
                 }
-                if accum == Accum::Replace {
-                    out.fill(T::ZERO);
-                }
-                let shape = g.shape();
-                let (sa, sb) = (Stretch::of(&shapes[0], shape), Stretch::of(&shapes[1], shape));
-                let (n, last) = (shape.last(), shape.rank().max(1) - 1);
-                let (step_a, step_b) = (sa.0[last], sb.0[last]);
-                for_each_run(shape, sa, sb, |io, ia, ib| {
-                    let (to, step) = if side == 0 { (ia, step_a) } else { (ib, step_b) };
-                    let g = &g.data()[io..io + n];
-                    if step == 0 {
-                        let mut sum = T::ZERO;
-                        for (k, &g) in g.iter().enumerate() {
-                            let (a, b) = pair(ia + k * step_a, ib + k * step_b);
-                            sum += g * derivative(a, b);
-                        }
-                        out[to] += sum;
-                    } else {
-                        for (k, (d, &g)) in out[to..to + n].iter_mut().zip(g).enumerate() {
-                            let (a, b) = pair(ia + k * step_a, ib + k * step_b);
-                            *d += g * derivative(a, b);
-                        }
+                let slices = Slices::of([&shapes[0], &shapes[1]], g.shape());
+                // A slice of the gradient belongs to one thread, unless all slices meet in it.
+                let own = slices.operands[side];
+                let (per_thread, repeats) = if own > 0 { (own, 1) } else { (out.len(), slices.count) };
+                let work = 2 * g.len();
+                parallel::for_each_chunk(out, per_thread, work, |first, out| {
+                    if accum == Accum::Replace {
+                        out.fill(T::ZERO);
+                    }
+                    for i in first * repeats..(first + 1) * repeats {
+                        let g = &g.data()[i * slices.result..][..slices.result];
+                        // Functions whose derivatives are constant never look at their arguments.
+                        let (a, b) = operands
+                            .map_or((g, g), |(a, b)| (&a[i * slices.operands[0]..], &b[i * slices.operands[1]..]));
+                        simd::dispatch(
+                            #[inline(always)]
+                            || match side {
+                                0 => slices.gradient::<T>(0, out, g, a, b, operands.is_some(), F::da),
+                                _ => slices.gradient::<T>(1, out, g, a, b, operands.is_some(), F::db),
+                            },
+                        );
                     }
                 });
             });

@@ -165,8 +165,9 @@ impl Plan {
                 let top = (b * self.padded_height() + y + ring) * across + x + ring;
                 let mut sum = [T::ZERO; LANES];
                 for (dy, taps) in taps.chunks_exact(window).enumerate() {
-                    let pixels = image[(top + dy * across) * n + k..].iter().step_by(n);
-                    for (pixel, tap) in pixels.zip(taps) {
+                    let pixels = &image[(top + dy * across) * n + k..][..(window - 1) * n + 1];
+                    for (dx, tap) in taps.iter().enumerate() {
+                        let pixel = &pixels[dx * n];
                         for (s, (&p, &t)) in sum.iter_mut().zip(pixel.iter().zip(tap)) {
                             *s = p.mul_add(t, *s);
                         }
@@ -189,9 +190,9 @@ impl Plan {
                     let span = Span { b, rows: rows.clone(), k, block: *block, dy, dx };
                     let out = &mut out[dx..];
                     dx += match out.len() {
-                        7.. => self.tap_group::<T, 7>(out, image, g, span),
-                        5.. => self.tap_group::<T, 5>(out, image, g, span),
-                        3.. => self.tap_group::<T, 3>(out, image, g, span),
+                        4.. => self.tap_group::<T, 4>(out, image, g, span),
+                        3 => self.tap_group::<T, 3>(out, image, g, span),
+                        2 => self.tap_group::<T, 2>(out, image, g, span),
                         _ => self.tap_group::<T, 1>(out, image, g, span),
                     };
                 }
@@ -199,7 +200,7 @@ impl Plan {
         }
     }
 
-    /// G taps beside each other; gives G.
+    /// G taps beside each other; gives G. Up to four stay in registers.
     fn tap_group<T: Float, const G: usize>(
         &self,
         out: &mut [[T; LANES]],
@@ -209,26 +210,30 @@ impl Plan {
     ) -> usize {
         let (n, across) = (self.blocks.len(), self.padded_width());
         let ring = self.pad - s.block.window / 2;
-        let mut sums = [[T::ZERO; LANES]; G];
+        let mut result = [[T::ZERO; LANES]; G];
         simd::dispatch(
             #[inline(always)]
             || {
+                // Sums that live outside the closure would be stored to memory at every step.
+                let mut sums = result;
                 for y in s.rows {
                     let row = s.b * self.padded_height() + y;
                     let g = &g[((row + self.pad) * across + self.pad) * n + s.k..];
                     let v = &image[((row + ring + s.dy) * across + ring + s.dx) * n + s.k..];
-                    let beside = v.windows((G - 1) * n + 1).step_by(n);
-                    for (g, v) in g.iter().step_by(n).zip(beside).take(self.width) {
-                        for (sums, v) in sums.iter_mut().zip(v.iter().step_by(n)) {
+                    for x in 0..self.width {
+                        let g = &g[x * n];
+                        for (j, sums) in sums.iter_mut().enumerate() {
+                            let v = &v[(x + j) * n];
                             for (s, (&g, &v)) in sums.iter_mut().zip(g.iter().zip(v)) {
                                 *s = g.mul_add(v, *s);
                             }
                         }
                     }
                 }
+                result = sums;
             },
         );
-        out[..G].copy_from_slice(&sums);
+        out[..G].copy_from_slice(&result);
         G
     }
 }

@@ -94,9 +94,9 @@ impl Heads {
             while i < c {
                 let (from, out) = (h * c + i, &mut out[i * c..]);
                 i += match c - i {
-                    8.. => group::<T, 8>(out, a, from, b, window, skip, c),
                     4.. => group::<T, 4>(out, a, from, b, window, skip, c),
-                    2.. => group::<T, 2>(out, a, from, b, window, skip, c),
+                    3 => group::<T, 3>(out, a, from, b, window, skip, c),
+                    2 => group::<T, 2>(out, a, from, b, window, skip, c),
                     _ => group::<T, 1>(out, a, from, b, window, skip, c),
                 };
             }
@@ -109,7 +109,7 @@ fn columns<T>(m: Rows<T>, first: usize, cols: usize) -> Rows<T> {
     Rows { data: if m.rows == 0 { &[] } else { &m.data[first..] }, rows: m.rows, cols, row_stride: m.row_stride }
 }
 
-/// G rows of the sum of outer products; gives G.
+/// G rows of the sum of outer products; gives G. Up to four stay in registers.
 fn group<T: Float, const G: usize>(
     out: &mut [T],
     a: Rows<T>,
@@ -119,10 +119,12 @@ fn group<T: Float, const G: usize>(
     skip: usize,
     c: usize,
 ) -> usize {
-    let mut sums = [[T::ZERO; LANES]; G];
+    let mut result = [[T::ZERO; LANES]; G];
     simd::dispatch(
         #[inline(always)]
         || {
+            // Sums that live outside the closure would be stored to memory at every step.
+            let mut sums = result;
             let rows = a.data.chunks(a.row_stride).zip(b.data.chunks(b.row_stride)).take(a.rows);
             for (a, b) in rows {
                 let (Some(a), Some(b)) = (a[from..].first_chunk::<G>(), b[window..].first_chunk::<LANES>()) else {
@@ -132,9 +134,10 @@ fn group<T: Float, const G: usize>(
                     sums.iter_mut().zip(b).for_each(|(s, &b)| *s = a.mul_add(b, *s));
                 }
             }
+            result = sums;
         },
     );
-    for (out, sums) in out.chunks_exact_mut(c).zip(&sums) {
+    for (out, sums) in out.chunks_exact_mut(c).zip(&result) {
         out.copy_from_slice(&sums[skip..skip + c]);
     }
     G

@@ -44,7 +44,8 @@ impl<T: Float> Pico<T> {
     fn load() -> Self {
         let reference = Reference::read();
         let (model, mut params) = MonoVit::new(Preset::Pico.config(), 0);
-        checkpoint::import(&mut params, &reference.under("weights/"), Path::new("pico")).expect("the same names and shapes");
+        checkpoint::import(&mut params, &reference.under("weights/"), Path::new("pico"))
+            .expect("the same names and shapes");
         Pico { model, params, reference }
     }
 
@@ -98,7 +99,12 @@ fn outputs_and_gradients<T: Float>(bound: f64, gradient_bound: f64, zero: f64) {
 
     let (c, disparities, found) = pico.forward(&Tape::new());
     for (s, disparity) in disparities.iter().enumerate() {
-        assert_error(disparity.value(), &pico.reference.map(&format!("out/disp/{s}")), bound, &format!("disparity {s}"));
+        assert_error(
+            disparity.value(),
+            &pico.reference.map(&format!("out/disp/{s}")),
+            bound,
+            &format!("disparity {s}"),
+        );
     }
     let expected = pico.reference.get("out/losses").data()[0].f64();
     let total = found.total.value().item().f64();
@@ -154,7 +160,12 @@ fn three_steps_and_evaluation_in_f64() {
     }
     for (_, p) in pico.params.iter() {
         let expected = pico.reference.get(&format!("after3/{}", p.name()));
-        assert_error(&p.layout.export(&p.value), expected, 1e-9, p.name());
+        // Where the gradient is zero by construction, AdamW divides rounding noise by eps: of the order 1e-14 a step.
+        let ours = p.layout.export(&p.value);
+        let scale = expected.data().iter().fold(1e-3, |m: f64, x| m.max(x.abs()));
+        for (k, (x, e)) in ours.data().iter().zip(expected.data()).enumerate() {
+            assert!((x - e).abs() <= 1e-9 * scale, "{}, element {k}: {x} for {e}", p.name());
+        }
     }
     let c = Context::inference(&pico.params);
     let target = Var::constant(pico.reference.map("in/target"));
