@@ -64,15 +64,14 @@ fn stays(pieces: usize, work: usize) -> bool {
 }
 
 /// Runs `f` inside the pool that kernels use.
-fn in_pool(f: impl FnOnce() + Send) {
+fn in_pool(f: &mut (dyn FnMut() + Send)) {
     match WIDTH.with_borrow(Width::clone) {
         Width::Pool(pool) => pool.install(f),
         _ => f(),
     }
 }
 
-/// Halves the chunks until one is left, and the halves run side by side. Generic in the element alone: rayon's machinery
-/// is compiled once for each element type, and not for each kernel.
+/// Halves the chunks until one is left, and the halves run side by side.
 fn split<T: Send>(data: &mut [T], chunk: usize, first: usize, f: &(dyn Fn(usize, &mut [T]) + Sync)) {
     let chunks = data.len().div_ceil(chunk);
     if chunks <= 1 {
@@ -82,46 +81,39 @@ fn split<T: Send>(data: &mut [T], chunk: usize, first: usize, f: &(dyn Fn(usize,
     rayon::join(|| split(left, chunk, first, f), || split(right, chunk, first + chunks / 2, f));
 }
 
+/// The one place where work is handed over. The kernel comes as a `dyn Fn`: it is compiled once, not once for each way
+/// of running it, and the machinery once for each element type.
+fn run<T: Send>(data: &mut [T], chunk: usize, work: usize, f: &(dyn Fn(usize, &mut [T]) + Sync)) {
+    if stays(data.len().div_ceil(chunk), work) {
+        data.chunks_mut(chunk).enumerate().for_each(|(i, c)| f(i, c));
+    } else {
+        in_pool(&mut || split(data, chunk, 0, f));
+    }
+}
+
 /// Calls `f(i)` for every i below `count`, on all threads. `work` is a rough count of elementary operations: below
 /// [`WORTHWHILE`] everything stays on the calling thread.
 pub fn for_each(count: usize, work: usize, f: impl Fn(usize) + Sync + Send) {
-    if stays(count, work) {
-        return (0..count).for_each(f);
-    }
     // Nothing to be cut but the indices.
-    in_pool(|| split(&mut vec![(); count], 1, 0, &|i, _| f(i)));
+    run(&mut vec![(); count], 1, work, &|i, _| f(i));
 }
 
 /// Collects `f(i)` for every i below `count`, in order.
 pub fn map<R: Send>(count: usize, work: usize, f: impl Fn(usize) -> R + Sync + Send) -> Vec<R> {
-    if stays(count, work) {
-        return (0..count).map(f).collect();
-    }
     let mut results: Vec<Option<R>> = (0..count).map(|_| None).collect();
-    in_pool(|| split(&mut results, 1, 0, &|i, result| result[0] = Some(f(i))));
+    run(&mut results, 1, work, &|i, result| result[0] = Some(f(i)));
     results.into_iter().flatten().collect()
 }
 
 /// Cuts `data` into chunks of `chunk` elements (the last may be shorter) and calls `f(index, chunk)` for each.
 pub fn for_each_chunk<T: Send>(data: &mut [T], chunk: usize, work: usize, f: impl Fn(usize, &mut [T]) + Sync + Send) {
-    let chunk = chunk.max(1);
-    if data.is_empty() {
-        return;
-    }
-    if stays(data.len().div_ceil(chunk), work) {
-        data.chunks_mut(chunk).enumerate().for_each(|(i, c)| f(i, c));
-    } else {
-        in_pool(|| split(data, chunk, 0, &f));
-    }
+    run(data, chunk.max(1), work, &f);
 }
 
 /// Calls `f` for every piece: for kernels that write several slices, cut and zipped by the caller.
 pub fn for_each_piece<P: Send>(pieces: impl IntoIterator<Item = P>, work: usize, f: impl Fn(P) + Sync + Send) {
     let mut pieces: Vec<Option<P>> = pieces.into_iter().map(Some).collect();
-    if stays(pieces.len(), work) {
-        return pieces.into_iter().flatten().for_each(f);
-    }
-    in_pool(|| split(&mut pieces, 1, 0, &|_, piece| piece.iter_mut().filter_map(Option::take).for_each(&f)));
+    run(&mut pieces, 1, work, &|_, piece| piece.iter_mut().filter_map(Option::take).for_each(&f));
 }
 
 /// Elementary operations below which handing work over costs more than it saves.

@@ -5,7 +5,7 @@
 
 use std::sync::LazyLock;
 
-use pulp::{Arch, Simd, WithSimd, bytemuck};
+use pulp::{Arch, Simd, WithSimd};
 
 static ARCH: LazyLock<Arch> = LazyLock::new(Arch::new);
 
@@ -43,7 +43,7 @@ pub trait Vector: Copy + 'static {
 }
 
 macro_rules! vector {
-    ($t:ty, $v:ident, $lanes:ident, $splat:ident, $load:ident, $store:ident, $add:ident, $fma:ident) => {
+    ($t:ty, $v:ident, $lanes:ident, $splat:ident, $load:ident, $store:ident, $add:ident, $fma:ident, $of:ident, $of_mut:ident) => {
         impl Vector for $t {
             type V<S: Simd> = S::$v;
 
@@ -57,7 +57,7 @@ macro_rules! vector {
             }
             #[inline(always)]
             fn load<S: Simd>(_: S, x: &[$t]) -> S::$v {
-                bytemuck::pod_read_unaligned(bytemuck::cast_slice(&x[..S::$lanes]))
+                S::$of(&x[..S::$lanes]).0[0]
             }
             #[inline(always)]
             fn load_part<S: Simd>(simd: S, x: &[$t]) -> S::$v {
@@ -65,7 +65,7 @@ macro_rules! vector {
             }
             #[inline(always)]
             fn store<S: Simd>(_: S, out: &mut [$t], v: S::$v) {
-                out[..S::$lanes].copy_from_slice(bytemuck::cast_slice(std::slice::from_ref(&v)));
+                S::$of_mut(&mut out[..S::$lanes]).0[0] = v;
             }
             #[inline(always)]
             fn store_part<S: Simd>(simd: S, out: &mut [$t], v: S::$v) {
@@ -83,8 +83,30 @@ macro_rules! vector {
     };
 }
 
-vector!(f32, f32s, F32_LANES, splat_f32s, partial_load_f32s, partial_store_f32s, add_f32s, mul_add_f32s);
-vector!(f64, f64s, F64_LANES, splat_f64s, partial_load_f64s, partial_store_f64s, add_f64s, mul_add_f64s);
+vector!(
+    f32,
+    f32s,
+    F32_LANES,
+    splat_f32s,
+    partial_load_f32s,
+    partial_store_f32s,
+    add_f32s,
+    mul_add_f32s,
+    as_simd_f32s,
+    as_mut_simd_f32s
+);
+vector!(
+    f64,
+    f64s,
+    F64_LANES,
+    splat_f64s,
+    partial_load_f64s,
+    partial_store_f64s,
+    add_f64s,
+    mul_add_f64s,
+    as_simd_f64s,
+    as_mut_simd_f64s
+);
 
 /// Runs a kernel that is written in [`Vector`]s with those of the best instruction set of this machine.
 #[inline(always)]

@@ -1,7 +1,8 @@
 //! The kernels: convolution of each channel with its own window, over channels that lie side by side.
 //!
 //! They work on [`Rows`], one row a pixel, so that a range of channels of a wider tensor (the values among queries, keys
-//! and values) is convolved where it lies. Channels go in blocks of one vector register, the last one perhaps in part.
+//! and values) is convolved where it lies. Channels go in blocks of one vector register; the last block overlaps the one
+//! before it where the count is no multiple, and only its new channels are written.
 
 use pulp::{Simd, WithSimd};
 
@@ -125,30 +126,59 @@ impl<T: Float> WithSimd for Convolve<'_, T> {
         for (i, out) in out.chunks_mut(pass.width * stride).enumerate() {
             let at = pass.first_row + i;
             let line = Line { pass, x, bias, image: at / pass.height, row: at % pass.height, stride, accum };
-            let full = x.cols / T::lanes::<S>() * T::lanes::<S>();
-            for first in (0..full).step_by(T::lanes::<S>()) {
-                line.block(simd, Block::<false> { first, end: first + T::lanes::<S>() }, out);
+            if x.cols < T::lanes::<S>() {
+                line.block(simd, Block::<true> { first: 0, end: x.cols, skip: 0 }, out);
+                continue;
             }
-            if full < x.cols {
-                line.block(simd, Block::<true> { first: full, end: x.cols }, out);
+            for block in blocks(x.cols, T::lanes::<S>()) {
+                line.block(simd, block, out);
             }
         }
     }
 }
 
-/// A block of channels: those of a vector, or (`PART`) fewer.
+/// A block of channels: those of a vector, or (`PART`) all there are, fewer than that.
 #[derive(Clone, Copy)]
 struct Block<const PART: bool> {
     first: usize,
     end: usize,
+    /// How many of its channels the block before has done already.
+    skip: usize,
+}
+
+/// The most elements in a vector.
+const MAX_LANES: usize = 16;
+/// The most pixels loaded for a tile: `(TILE - 1) * 2 + 3` or `TILE - 1 + 7`.
+const SPAN: usize = 10;
+
+/// The blocks of `c` channels, at least a vector of them.
+#[inline(always)]
+fn blocks(c: usize, lanes: usize) -> impl Iterator<Item = Block<false>> {
+    (0..c).step_by(lanes).map(move |from| {
+        let first = from.min(c - lanes);
+        Block { first, end: first + lanes, skip: from - first }
+    })
 }
 
 impl<const PART: bool> Block<PART> {
     /// The block of the pixel or tap that begins at `at`.
     #[inline(always)]
     fn load<T: Float, S: Simd>(self, simd: S, x: &[T], at: usize) -> T::V<S> {
-        let x = &x[at + self.first..at + self.end];
-        if PART { T::load_part(simd, x) } else { T::load(simd, x) }
+        let x = &x[at + self.first..];
+        if PART { T::load_part(simd, &x[..self.end]) } else { T::load(simd, x) }
+    }
+
+    /// The block of the first `count` pixels, `step` apart.
+    #[inline(always)]
+    fn load_row<T: Float, S: Simd>(self, simd: S, x: &[T], count: usize, step: usize) -> [T::V<S>; SPAN] {
+        let mut row = [T::splat(simd, T::ZERO); SPAN];
+        let mut x = &x[self.first..];
+        for v in &mut row[..count] {
+            *v = if PART { T::load_part(simd, &x[..self.end]) } else { T::load(simd, x) };
+            // Only the last pixel of a tensor has nothing after it.
+            x = x.get(step..).unwrap_or_default();
+        }
+        row
     }
 
     #[inline(always)]
@@ -157,8 +187,17 @@ impl<const PART: bool> Block<PART> {
             Accum::Replace => v,
             Accum::Add => T::vector_add(simd, self.load(simd, out, at), v),
         };
-        let out = &mut out[at + self.first..at + self.end];
-        if PART { T::store_part(simd, out, v) } else { T::store(simd, out, v) }
+        let out = &mut out[at + self.first..];
+        if PART {
+            T::store_part(simd, &mut out[..self.end], v);
+        } else if self.skip == 0 {
+            T::store(simd, out, v);
+        } else {
+            let mut block = [T::ZERO; MAX_LANES];
+            T::store(simd, &mut block, v);
+            let new = self.skip..self.end - self.first;
+            out[new.clone()].iter_mut().zip(&block[new]).for_each(|(o, &b)| *o = b);
+        }
     }
 }
 
@@ -222,12 +261,12 @@ impl<T: Float> Line<'_, T> {
         let mut sums = [block.load(simd, self.bias, 0); TILE];
         for ky in ky_from..ky_to {
             let pixel = (self.image * height + self.row * STRIDE + ky - padding) * width + ox * STRIDE - padding;
-            let x = &self.x.data[pixel * step..];
+            let x = block.load_row(simd, &self.x.data[pixel * step..], (TILE - 1) * STRIDE + K, step);
             let w = &self.pass.w[ky * K * c..(ky + 1) * K * c];
             for kx in 0..K {
                 let w = block.load(simd, w, kx * c);
                 for (p, sum) in sums.iter_mut().enumerate() {
-                    *sum = T::fma(simd, block.load(simd, x, (p * STRIDE + kx) * step), w, *sum);
+                    *sum = T::fma(simd, x[p * STRIDE + kx], w, *sum);
                 }
             }
         }
@@ -304,62 +343,110 @@ impl<T: Float> WithSimd for Gather<'_, T> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         let Gather { pass, g, out, stride, accum } = self;
-        let (lanes, c, window) = (T::lanes::<S>(), g.cols, pass.window);
-        let full = c / lanes * lanes;
+        let (c, window) = (g.cols, pass.window);
         for (i, out) in out.chunks_mut(window.width * stride).enumerate() {
             let at = pass.first_row + i;
             let (image, y) = (at / window.height, at % window.height + window.padding);
-            for (ix, out) in out.chunks_mut(stride).enumerate() {
-                let x = ix + window.padding;
-                for first in (0..full).step_by(lanes) {
-                    let block = Block::<false> { first, end: first + lanes };
-                    block.store(simd, out, 0, pass.gather(simd, block, g, [image, y, x]), accum);
-                }
-                if full < c {
-                    let block = Block::<true> { first: full, end: c };
-                    block.store(simd, out, 0, pass.gather(simd, block, g, [image, y, x]), accum);
-                }
+            let line = GatherLine { pass, g, image, y, stride, accum };
+            if c < T::lanes::<S>() {
+                line.block(simd, Block::<true> { first: 0, end: c, skip: 0 }, out);
+                continue;
+            }
+            for block in blocks(c, T::lanes::<S>()) {
+                line.block(simd, block, out);
             }
         }
     }
 }
 
-impl<T: Float> Pass<'_, T> {
-    /// The gradient of pixel (y, x), counted with the padding. Tap k of output o reads pixel o stride + k: every
-    /// stride-th tap meets this one.
+/// One row of the input's gradient: row `y`, counted with the padding.
+#[derive(Clone, Copy)]
+struct GatherLine<'a, T> {
+    pass: Pass<'a, T>,
+    g: Rows<'a, T>,
+    image: usize,
+    y: usize,
+    stride: usize,
+    accum: Accum,
+}
+
+impl<T: Float> GatherLine<'_, T> {
+    /// One block of channels of the row.
     #[inline(always)]
-    fn gather<S: Simd, const PART: bool>(
+    fn block<S: Simd, const PART: bool>(&self, simd: S, block: Block<PART>, out: &mut [T]) {
+        let (window, width) = (self.pass.window, self.pass.window.width);
+        let (mut from, mut to) = (0, 0);
+        if (window.kernel, window.stride) == ([3, 3], 2) {
+            // Columns 2m and 2m + 1, counted with the padding, of those m where outputs m and m - 1 both exist.
+            let first = window.padding.div_ceil(2).max(1);
+            let last = ((width + window.padding) / 2).min(self.pass.width).max(first);
+            (from, to) = (2 * first - window.padding, 2 * last - window.padding);
+            let (row, lines) = (self.y / 2, [self.y / 2, (self.y / 2).wrapping_sub(1)]);
+            match (self.y % 2, lines.map(|line| line < self.pass.height)) {
+                (1, [true, _]) => self.pairs(simd, block, out, [(row, 1)], first, last),
+                (0, [true, true]) => self.pairs(simd, block, out, [(row, 0), (row - 1, 2)], first, last),
+                (0, [true, false]) => self.pairs(simd, block, out, [(row, 0)], first, last),
+                (0, [false, true]) => self.pairs(simd, block, out, [(row - 1, 2)], first, last),
+                _ => self.pairs(simd, block, out, [], first, last),
+            }
+        }
+        for ix in (0..from.min(width)).chain(to..width) {
+            let sum = self.pixel(simd, block, ix + window.padding);
+            block.store(simd, out, ix * self.stride, sum, self.accum);
+        }
+    }
+
+    /// A window of 3 x 3 with stride 2: of each pair of columns the even one meets the outer taps of two outputs, the odd
+    /// one the middle tap of one. `rows`: the rows of the output that meet this one, each with its row of taps.
+    #[inline(always)]
+    fn pairs<S: Simd, const PART: bool, const R: usize>(
         &self,
         simd: S,
         block: Block<PART>,
-        g: Rows<T>,
-        [image, y, x]: [usize; 3],
-    ) -> T::V<S> {
-        let Window { stride, kernel: [kh, kw], .. } = self.window;
-        // The division by a stride of 2 must not cost one.
-        let (oy, ox, ky, kx) = match stride {
-            2 => (y / 2, x / 2, y % 2, x % 2),
-            s => (y / s, x / s, y % s, x % s),
-        };
+        out: &mut [T],
+        rows: [(usize, usize); R],
+        first: usize,
+        last: usize,
+    ) {
+        let (c, step) = (self.g.cols, self.g.row_stride);
+        let taps = rows.map(|(_, ky)| [0, 1, 2].map(|kx| block.load(simd, self.pass.w, (ky * 3 + kx) * c)));
+        let lines = rows.map(|(oy, _)| (self.image * self.pass.height + oy) * self.pass.width);
+        let load = |line: usize, ox: usize| block.load(simd, self.g.data, (line + ox) * step);
+        let mut before = lines.map(|line| if first < last { load(line, first - 1) } else { T::splat(simd, T::ZERO) });
+        for m in first..last {
+            let mut sums = [T::splat(simd, T::ZERO); 2];
+            for ((&line, before), w) in lines.iter().zip(&mut before).zip(&taps) {
+                let here = load(line, m);
+                sums[0] = T::fma(simd, *before, w[2], T::fma(simd, here, w[0], sums[0]));
+                sums[1] = T::fma(simd, here, w[1], sums[1]);
+                *before = here;
+            }
+            let at = (2 * m - self.pass.window.padding) * self.stride;
+            block.store(simd, out, at, sums[0], self.accum);
+            block.store(simd, out, at + self.stride, sums[1], self.accum);
+        }
+    }
+
+    /// The gradient of the pixel in column `x`, counted with the padding. Tap k of output o reads pixel o stride + k:
+    /// every stride-th tap meets this one.
+    #[inline(always)]
+    fn pixel<S: Simd, const PART: bool>(&self, simd: S, block: Block<PART>, x: usize) -> T::V<S> {
+        let Pass { window: Window { stride, kernel: [kh, kw], .. }, height, width, w, .. } = self.pass;
         let mut sum = T::splat(simd, T::ZERO);
-        let mut row = oy;
-        let mut ky = ky;
-        while ky < kh {
-            if row < self.height {
-                let (mut column, mut kx) = (ox, kx);
-                while kx < kw {
-                    if column < self.width {
-                        let at = (image * self.height + row) * self.width + column;
-                        let d = block.load(simd, g.data, at * g.row_stride);
-                        sum = T::fma(simd, d, block.load(simd, self.w, (ky * kw + kx) * g.cols), sum);
-                    }
-                    // Below 0 this wraps to beyond the width, and stays out.
-                    column = column.wrapping_sub(1);
-                    kx += stride;
+        for (back, ky) in (self.y % stride..kh).step_by(stride).enumerate() {
+            // Below 0 this wraps to beyond the height, and stays out; so for the columns.
+            let oy = (self.y / stride).wrapping_sub(back);
+            if oy >= height {
+                continue;
+            }
+            for (back, kx) in (x % stride..kw).step_by(stride).enumerate() {
+                let ox = (x / stride).wrapping_sub(back);
+                if ox < width {
+                    let at = (self.image * height + oy) * width + ox;
+                    let g = block.load(simd, self.g.data, at * self.g.row_stride);
+                    sum = T::fma(simd, g, block.load(simd, w, (ky * kw + kx) * self.g.cols), sum);
                 }
             }
-            row = row.wrapping_sub(1);
-            ky += stride;
         }
         sum
     }
@@ -410,14 +497,14 @@ impl<T: Float> WithSimd for Weigh<'_, T> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
-        let (lanes, c) = (T::lanes::<S>(), self.x.cols);
-        let full = c / lanes * lanes;
+        let c = self.x.cols;
         for at in self.pass.first_row..self.pass.first_row + self.rows {
-            for first in (0..full).step_by(lanes) {
-                self.row(simd, Block::<false> { first, end: first + lanes }, at);
+            if c < T::lanes::<S>() {
+                self.row(simd, Block::<true> { first: 0, end: c, skip: 0 }, at);
+                continue;
             }
-            if full < c {
-                self.row(simd, Block::<true> { first: full, end: c }, at);
+            for block in blocks(c, T::lanes::<S>()) {
+                self.row(simd, block, at);
             }
         }
     }
@@ -467,12 +554,17 @@ impl<T: Float> Weigh<'_, T> {
         let (c, step, width, padding) = (self.x.cols, self.x.row_stride, self.pass.width, self.pass.window.padding);
         let (from, to) = self.pass.window.interior(width);
         let mut sums = [[T::splat(simd, T::ZERO); K]; R];
-        for ox in from..to {
-            let g = block.load(simd, self.g.data, (at * width + ox) * self.g.row_stride);
+        let tiled = from + (to - from) / TILE * TILE;
+        for ox in (from..tiled).step_by(TILE) {
+            let g_step = self.g.row_stride;
+            let g = block.load_row(simd, &self.g.data[(at * width + ox) * g_step..], TILE, g_step);
             for (sums, line) in sums.iter_mut().zip(lines) {
                 let x = &self.x.data[(line + ox * STRIDE - padding) * step..];
-                for (kx, sum) in sums.iter_mut().enumerate() {
-                    *sum = T::fma(simd, block.load(simd, x, kx * step), g, *sum);
+                let x = block.load_row(simd, x, (TILE - 1) * STRIDE + K, step);
+                for p in 0..TILE {
+                    for (kx, sum) in sums.iter_mut().enumerate() {
+                        *sum = T::fma(simd, x[p * STRIDE + kx], g[p], *sum);
+                    }
                 }
             }
         }
@@ -483,7 +575,7 @@ impl<T: Float> Weigh<'_, T> {
         }
         for (r, line) in lines.into_iter().enumerate() {
             self.singles(simd, block, at, ky + r, line, 0, from);
-            self.singles(simd, block, at, ky + r, line, to, width);
+            self.singles(simd, block, at, ky + r, line, tiled, width);
         }
     }
 
