@@ -29,7 +29,6 @@ pub fn tensor(file: &SafeTensors, name: &str) -> Tensor<f64> {
 
 /// How a tensor in PyTorch's layout becomes one of ours.
 #[derive(Clone, Copy, Debug)]
-#[allow(dead_code)]
 pub enum Layout {
     /// As it is.
     Same,
