@@ -96,8 +96,7 @@ impl Report {
         }
         for (i, input) in self.inputs.iter().enumerate() {
             let Some(r) = input else { continue };
-            // Written so that NaN fails.
-            if !(r.error <= self.options.tolerance) {
+            if r.error.is_nan() || r.error > self.options.tolerance {
                 return Some(format!(
                     "input {i}, element {}: analytic {:e}, numeric {:e}, error {:.1e} of {:.1e} allowed",
                     r.worst, r.analytic, r.numeric, r.error, self.options.tolerance
@@ -229,7 +228,7 @@ fn compare(analytic: &Tensor<f64>, numeric: &[f64], scale: f64, kinks: Vec<usize
         let difference = (a - n).abs();
         // Where the analytic gradient is zero throughout, the numeric one is held to the same size as an absolute error.
         let error = difference / if scale > 0.0 { scale } else { 1.0 };
-        if !(error <= r.error) {
+        if error.is_nan() || error > r.error {
             (r.error, r.worst, r.analytic, r.numeric) = (error, k, a, n);
         }
     }

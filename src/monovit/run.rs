@@ -174,7 +174,7 @@ pub enum Event<'a> {
 /// How a run ended.
 pub enum Ended {
     /// All steps are done.
-    Finished(Option<RunMetrics>),
+    Finished(Option<Box<RunMetrics>>),
     /// Someone asked it to stop; it can be resumed.
     Interrupted(u64),
 }
@@ -307,7 +307,7 @@ impl Run {
             }
         }
         drop(loader);
-        self.finish(data, test, how, &mut tell).map(Ended::Finished)
+        Ok(Ended::Finished(self.finish(data, test, how, &mut tell)?.map(Box::new)))
     }
 
     /// A fixed set of batches without augmentation.

@@ -48,8 +48,8 @@ impl<T: Float> Op<T> for MinReprojection {
                 let mut best = Tensor::build([winner.len()], |best| best.copy_from_slice(part(0)));
                 let best = best.data_mut();
                 winner.fill(T::ZERO);
-                for k in 1..inputs.len() {
-                    let (candidate, index) = (&inputs[k].data()[i * tile..][..winner.len()], T::of(k as f64));
+                for (k, candidate) in inputs.iter().enumerate().skip(1) {
+                    let (candidate, index) = (&candidate.data()[i * tile..][..winner.len()], T::of(k as f64));
                     simd::dispatch(
                         #[inline(always)]
                         || {

@@ -204,10 +204,10 @@ impl Kernel {
                         // A row is finished once the maps of the row below it are there (or there is none).
                         let ready = if row + 1 == height { 2 } else { 1 };
                         for _ in 0..ready {
-                            if row > first || row + 1 == height {
-                                if let Some((out, at)) = rows.next() {
-                                    self.finish_row(x, y, g, at, channels, &mut scratch, out, accum);
-                                }
+                            if (row > first || row + 1 == height)
+                                && let Some((out, at)) = rows.next()
+                            {
+                                self.finish_row(x, y, g, at, channels, &mut scratch, out, accum);
                             }
                         }
                     },

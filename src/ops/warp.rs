@@ -86,8 +86,8 @@ impl<T: Float> Projection<T> {
         let (base0, base1, base2) = (base(0), base(1), base(2));
         let epsilon = T::of(EPSILON);
         let before = [T::of((width - 2) as f64), T::of((height - 2) as f64)];
-        for i in 0..n {
-            let (u, d) = (T::of((u0 + i) as f64), depth[i]);
+        for (i, &d) in depth[..n].iter().enumerate() {
+            let u = T::of((u0 + i) as f64);
             let a = d.mul_add(u.mul_add(self.matrix[0][0], base0), self.offset[0]);
             let b = d.mul_add(u.mul_add(self.matrix[1][0], base1), self.offset[1]);
             let z = d.mul_add(u.mul_add(self.matrix[2][0], base2), self.offset[2]);

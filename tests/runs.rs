@@ -1,0 +1,123 @@
+//! Training runs from the outside: resumed and uninterrupted runs agree, and bad input costs no time.
+#![cfg(feature = "cli")]
+
+use std::path::Path;
+use std::process::{Command, Output};
+use std::sync::Arc;
+
+use parallax::data::Dataset;
+use parallax::data::street::{Street, StreetConfig};
+use parallax::monovit::Preset;
+use parallax::monovit::run::{Ended, Event, Run, RunConfig, RunData};
+
+fn street(seed: u64) -> Arc<dyn Dataset> {
+    let config = StreetConfig { height: 64, width: 96, sequences: 1, frames: 8, seed, ..StreetConfig::default() };
+    Arc::new(Street::render(&config, None))
+}
+
+fn data() -> RunData {
+    RunData { train: street(1), validation: street(2), test: Some(street(3)) }
+}
+
+fn config() -> RunConfig {
+    RunConfig { height: 64, width: 96, batch: 2, log_every: 1, checkpoint_every: 2, ..RunConfig::new(Preset::Pico, 5) }
+}
+
+/// The log without the times.
+fn log(folder: &Path) -> Vec<serde_json::Value> {
+    let text = std::fs::read_to_string(folder.join("log.jsonl")).expect("a log");
+    let lines = text.lines().map(|l| serde_json::from_str::<serde_json::Value>(l).expect("a line of JSON"));
+    lines
+        .map(|mut line| {
+            let fields = line.as_object_mut().expect("an object");
+            fields.remove("seconds");
+            fields.remove("data_seconds");
+            line
+        })
+        .collect()
+}
+
+#[test]
+fn a_resumed_run_ends_like_one_that_never_stopped() {
+    let place = tempfile::tempdir().expect("a folder");
+    let (whole, parts) = (place.path().join("whole"), place.path().join("parts"));
+    let data = data();
+
+    let ended = Run::create(&whole, config()).expect("a run").train(&data, || false, |_| ()).expect("trained");
+    assert!(matches!(ended, Ended::Finished(Some(_))));
+
+    let steps = std::cell::Cell::new(0);
+    let mut first = Run::create(&parts, config()).expect("a run");
+    let count = |event: Event| {
+        if let Event::Step(_) = event {
+            steps.set(steps.get() + 1);
+        }
+    };
+    let ended = first.train(&data, || steps.get() == 3, count).expect("trained");
+    assert!(matches!(ended, Ended::Interrupted(3)));
+    let ended = Run::resume(&parts).expect("resumed").train(&data, || false, |_| ()).expect("trained");
+    let Ended::Finished(Some(metrics)) = ended else { panic!("not finished") };
+
+    assert_eq!(log(&whole), log(&parts));
+    let weights = |folder: &Path| std::fs::read(folder.join("best.safetensors")).expect("weights");
+    assert!(weights(&whole) == weights(&parts), "the best weights differ");
+    assert!(metrics.after.abs_rel > 0.0 && metrics.before != metrics.after, "{metrics:?}");
+    for file in ["metrics.json", "config.toml", "images/00.png", "checkpoints/state.safetensors"] {
+        assert!(parts.join(file).is_file(), "{file}");
+    }
+}
+
+fn parallax(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_parallax")).args(arguments).output().expect("the program runs")
+}
+
+/// Fails with `status`, and says all of `words` on standard error.
+#[track_caller]
+fn fails(arguments: &[&str], status: i32, words: &[&str]) {
+    let output = parallax(arguments);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(status), "{arguments:?}: {said}");
+    for word in words {
+        assert!(said.contains(word), "{arguments:?} should say {word:?}: {said}");
+    }
+}
+
+#[test]
+fn wrong_settings_are_named_before_any_time_is_spent() {
+    let place = tempfile::tempdir().expect("a folder");
+    let out = place.path().join("run");
+    let out = out.to_str().expect("a path in UTF-8");
+    fails(&["train", "--height", "100", "--out", out], 1, &["--height", "100", "multiple of 32", "96"]);
+    fails(&["train", "--steps", "0", "--out", out], 1, &["--steps"]);
+    fails(&["train", "--stepz", "1"], 2, &["--stepz"]);
+    fails(&["train", "--data", "/no/such/folder", "--out", out], 1, &["/no/such/folder"]);
+    fails(&["train", "--resume", "/no/such/run"], 1, &["/no/such/run"]);
+    fails(&["gradcheck", "--op", "nonsense"], 1, &["--op", "conv2d"]);
+    assert!(!Path::new(out).exists(), "nothing was made");
+}
+
+#[test]
+fn a_folder_that_holds_something_is_not_written_into() {
+    let place = tempfile::tempdir().expect("a folder");
+    std::fs::write(place.path().join("precious.txt"), "mine").expect("written");
+    let error = Run::create(place.path(), config()).err().expect("refused").to_string();
+    assert!(error.contains("not empty") && error.contains("--resume"), "{error}");
+    assert_eq!(std::fs::read_dir(place.path()).expect("readable").count(), 1);
+}
+
+#[test]
+fn weights_that_are_not_weights_are_refused_by_name() {
+    let place = tempfile::tempdir().expect("a folder");
+    let file = place.path().join("weights.safetensors");
+    std::fs::write(&file, b"this is no checkpoint").expect("written");
+    let file = file.to_str().expect("a path in UTF-8");
+    fails(&["eval", "--weights", file], 1, &["weights.safetensors", "not a safetensors file"]);
+}
+
+#[test]
+fn info_counts_the_published_parameters() {
+    let output = parallax(&["info", "--preset", "small", "--height", "64", "--width", "96", "--batch", "1", "--json"]);
+    let info: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON and nothing else");
+    assert_eq!(info["parameters"]["encoder"], 22_603_400);
+    assert_eq!(info["parameters"]["depth"], 5_266_708);
+}
