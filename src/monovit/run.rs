@@ -50,6 +50,9 @@ pub struct RunConfig {
     pub val_split: Option<PathBuf>,
     /// Weights to start from.
     pub init: Option<PathBuf>,
+    /// The disparity (sigmoid, in (0, 1)) that an untrained network predicts: the biases of the four heads. Without, as
+    /// they are drawn: about 1/2, which is so near that what is nearer still has no disparity left.
+    pub initial_disparity: Option<f64>,
     /// A line in the log every so many steps.
     pub log_every: u64,
     /// The whole state is written, and the weights are validated, every so many steps.
@@ -76,13 +79,14 @@ impl RunConfig {
             split: None,
             val_split: None,
             init: None,
+            initial_disparity: Some(0.15),
             log_every: 10,
             checkpoint_every: 250,
             augment: Augment { flip: true, jitter: false },
             loss: LossConfig::default(),
             optim: OptimConfig {
-                encoder_rate: 6e-4,
-                rate: 6e-4,
+                encoder_rate: 4e-4,
+                rate: 4e-4,
                 decay: 0.01,
                 betas: [0.9, 0.999],
                 clip: 0.0,
@@ -104,6 +108,9 @@ impl RunConfig {
         if self.batch == 0 {
             return Err(Error::setting("--batch", "at least 1"));
         }
+        if self.initial_disparity.is_some_and(|d| d.is_nan() || d <= 0.0 || d >= 1.0) {
+            return Err(Error::setting("initial_disparity", "a number between 0 and 1"));
+        }
         if self.steps == 0 {
             return Err(Error::setting("--steps", "at least 1"));
         }
@@ -111,11 +118,12 @@ impl RunConfig {
     }
 }
 
-/// Sides of pictures are multiples of 32, because the deepest map has a 32nd of them.
+/// Sides of pictures are multiples of 32, because the deepest map has a 32nd of them, and at least 64, because a map of
+/// one pixel has nothing to be mirrored at its border.
 pub fn check_size(name: &str, size: usize) -> Result<()> {
-    if size == 0 || !size.is_multiple_of(32) || size > 8192 {
-        let below = (size / 32 * 32).clamp(32, 8192);
-        let message = format!("{size} is not a multiple of 32 from 32 to 8192; {below} would do");
+    if !size.is_multiple_of(32) || !(64..=8192).contains(&size) {
+        let below = (size / 32 * 32).clamp(64, 8192);
+        let message = format!("{size} is not a multiple of 32 from 64 to 8192; {below} would do");
         return Err(Error::setting(name, message));
     }
     Ok(())
@@ -213,6 +221,9 @@ impl Run {
         let text = toml::to_string(&config).map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
         write_bytes_atomically(folder.join("config.toml"), text.as_bytes())?;
         let mut run = Self::at(folder, config);
+        if let Some(disparity) = run.config.initial_disparity {
+            start_at(&mut run.trainer.params, disparity);
+        }
         if let Some(init) = run.config.init.clone() {
             let contents = checkpoint::read(&init)?;
             checkpoint::import(&mut run.trainer.params, &contents.tensors, &init)?;
@@ -392,6 +403,15 @@ impl Run {
             write_bytes_atomically(&path, bytes.get_ref())?;
         }
         Ok(())
+    }
+}
+
+/// Sets the biases of the disparity heads so that an input of zeros gives this disparity.
+fn start_at(params: &mut Params<f32>, disparity: f64) {
+    let logit = (disparity / (1.0 - disparity)).ln() as f32;
+    for scale in 0..4 {
+        let head = params.find(&format!("depth.convs.dispconv{scale}.conv.bias")).expect("every size has four heads");
+        params.value_mut(head).data_mut().fill(logit);
     }
 }
 

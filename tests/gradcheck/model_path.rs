@@ -56,7 +56,7 @@ fn one_and_two_threads_train_the_same_bits() {
 
 #[test]
 fn a_number_that_is_not_finite_stops_the_step_and_names_the_op() {
-    let street = street(32, 64);
+    let street = street(64, 64);
     let config = RunConfig::new(Preset::Pico, 10);
     let mut trainer = Trainer::new(config.model(), config.optim, config.loss, 0);
     let batch = batch_of_step(&street, Augment::default(), 2, 0, 0).expect("a batch");
