@@ -2,7 +2,7 @@
 //! ([`BatchNorm`]) or by given ones ([`BatchNormEval`]).
 //!
 //! Everything is a loop over rows of C channels. So that few channels vectorise as well as many, a row is read together
-//! with its followers, up to a [`width`] that is a multiple of the channels, and per-channel numbers are repeated to it.
+//! with its followers, up to a `width` that is a multiple of the channels, and per-channel numbers are repeated to it.
 
 use super::unary::{Function, Hardswish, Relu};
 use super::{Case, Checked, Input, Needs, Op, ShapeError, apply, apply1};
@@ -32,7 +32,7 @@ impl Activation {
 }
 
 /// `y = act((x - mean) / sqrt(var + eps) * weight + bias)`, mean and (biased) variance of each channel over all rows of
-/// x [.., C] (Ioffe and Szegedy, 1502.03167). Outputs y, and as auxiliary ones the mean [C] and the variance [C].
+/// x [.., C] (Ioffe and Szegedy, 1502.03167). Outputs y, and as auxiliary ones the mean \[C\] and the variance \[C\].
 #[derive(Clone, Copy, Debug)]
 pub struct BatchNorm {
     /// Added to the variance.

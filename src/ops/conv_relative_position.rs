@@ -451,7 +451,7 @@ impl Checked for ConvRelativePosition {
 
 impl<T: Float> Var<T> {
     /// `q * (depthwise convolution of v)` of q, k and v side by side in [batch, height * width, 3 C]; each window
-    /// (extent, heads, weight [extent, extent, channels], bias [channels]) over the next heads in order.
+    /// (extent, heads, weight [extent, extent, channels], bias \[channels\]) over the next heads in order.
     #[track_caller]
     pub fn conv_relative_position(
         &self,

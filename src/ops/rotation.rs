@@ -113,7 +113,7 @@ impl<T: Float> Op<T> for AxisAngleToRotation {
         (vec![y], v.clone())
     }
 
-    /// See [`rotation_gradient`].
+    /// See `rotation_gradient`.
     fn backward(&self, v: Tensor<T>, upstream: Upstream<T>, sink: &mut GradSink<T>) {
         let g = upstream.only();
         sink.accumulate(0, |out, accum| {

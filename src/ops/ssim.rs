@@ -372,7 +372,7 @@ impl<T: Float> Op<T> for SsimLoss {
         (vec![loss], [x.clone(), y.clone()])
     }
 
-    /// See [`Kernel::backward`].
+    /// See `Kernel::backward`.
     fn backward(&self, [x, y]: Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
         let g = upstream.only();
         sink.accumulate(0, |out, accum| self.kernel().backward(&x, &y, &g, out, accum));

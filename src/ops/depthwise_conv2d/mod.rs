@@ -8,7 +8,7 @@ use crate::tensor::gemm::{Rows, RowsMut};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 
 /// `y[oy, ox, c] = b[c] + sum over ky, kx of x[oy stride + ky - padding, ox stride + kx - padding, c] w[ky, kx, c]`,
-/// where x [batch, height, width, channels] is 0 outside the image; w [kh, kw, channels], b [channels].
+/// where x [batch, height, width, channels] is 0 outside the image; w [kh, kw, channels], b \[channels\].
 #[derive(Clone, Copy, Debug)]
 pub struct DepthwiseConv2d {
     /// Pixels from one position of the window to the next.
@@ -77,7 +77,7 @@ impl<T: Float> Op<T> for DepthwiseConv2d {
         (vec![y], saved)
     }
 
-    /// With i = o stride + k - padding: dx[i] = sum over those k, o of dy[o] w[k]; dw[k] = sum over o of x[i] dy[o];
+    /// With i = o stride + k - padding: dx\[i\] = sum over those k, o of dy\[o\] w\[k\]; dw\[k\] = sum over o of x\[i\] dy\[o\];
     /// db = the sum of dy's pixels.
     fn backward(&self, (x, w, shapes): Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
         let g = upstream.only();
@@ -143,7 +143,7 @@ impl Checked for DepthwiseConv2d {
 
 impl<T: Float> Var<T> {
     /// Convolves each channel of [batch, height, width, channels] with its own window w [kh, kw, channels], and adds its
-    /// bias [channels]. `padding` zeros on each side.
+    /// bias \[channels\]. `padding` zeros on each side.
     #[track_caller]
     pub fn depthwise_conv2d(&self, weight: &Self, bias: Option<&Self>, stride: usize, padding: usize) -> Self {
         let op = DepthwiseConv2d { stride, padding, tile: 0 };
