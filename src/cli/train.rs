@@ -188,11 +188,13 @@ fn configuration(args: &Args) -> Result<RunConfig> {
     Ok(c)
 }
 
-/// Sets the number of steps; a cosine ends with them.
+/// Sets the number of steps; a cosine ends with them, a fall comes after three quarters.
 fn set_steps(config: &mut RunConfig, count: u64) {
     config.steps = count;
-    if let Decay::Cosine { steps, .. } = &mut config.optim.schedule.decay {
-        *steps = count;
+    match &mut config.optim.schedule.decay {
+        Decay::Cosine { steps, .. } => *steps = count,
+        Decay::Step { at, .. } => *at = count / 4 * 3,
+        Decay::Constant | Decay::Exponential { .. } => {}
     }
 }
 

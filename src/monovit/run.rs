@@ -79,19 +79,19 @@ impl RunConfig {
             split: None,
             val_split: None,
             init: None,
-            initial_disparity: Some(0.15),
+            initial_disparity: None,
             log_every: 10,
             checkpoint_every: 250,
             augment: Augment { flip: true, jitter: false },
             loss: LossConfig::default(),
             optim: OptimConfig {
-                encoder_rate: 4e-4,
-                rate: 4e-4,
+                encoder_rate: 3e-4,
+                rate: 3e-4,
                 decay: 0.01,
                 betas: [0.9, 0.999],
                 clip: 0.0,
                 average: 0.99,
-                schedule: Schedule { warm_up: 100, decay: Decay::Cosine { steps, end: 0.01 } },
+                schedule: Schedule { warm_up: 100, decay: Decay::Step { at: steps / 4 * 3, factor: 0.1 } },
             },
         }
     }
