@@ -73,6 +73,15 @@ pub struct Trainer {
     seed: u64,
 }
 
+/// What the loss compares in a batch.
+fn views(batch: &Batch) -> Views<f32> {
+    Views {
+        pyramid: batch.pyramid.iter().cloned().map(Var::constant).collect(),
+        sources: batch.sources.iter().cloned().map(Var::constant).collect(),
+        intrinsics: batch.intrinsics.clone(),
+    }
+}
+
 const TIE_STREAM: u64 = 3 << 40;
 const DROP_STREAM: u64 = 4 << 40;
 
@@ -109,13 +118,8 @@ impl Trainer {
         let [prev, target, next] = batch.seen.each_ref().map(|t| Var::constant(t.clone()));
         let disparities = self.model.disparities(&c, &target);
         let transforms = self.model.transforms(&c, &prev, &target, &next);
-        let views = Views {
-            pyramid: batch.pyramid.iter().cloned().map(Var::constant).collect(),
-            sources: batch.sources.iter().cloned().map(Var::constant).collect(),
-            intrinsics: batch.intrinsics.clone(),
-        };
         let mut random = Random::new(self.seed, TIE_STREAM.wrapping_add(step));
-        let found = loss(&disparities, &transforms, &views, &self.loss, Some((&self.ties, &mut random)));
+        let found = loss(&disparities, &transforms, &views(batch), &self.loss, Some((&self.ties, &mut random)));
         (c, found)
     }
 
@@ -189,12 +193,7 @@ impl Trainer {
             let [prev, target, next] = batch.seen.each_ref().map(|t| Var::constant(t.clone()));
             let disparities = self.model.disparities(&c, &target);
             let transforms = self.model.transforms(&c, &prev, &target, &next);
-            let views = Views {
-                pyramid: batch.pyramid.iter().cloned().map(Var::constant).collect(),
-                sources: batch.sources.iter().cloned().map(Var::constant).collect(),
-                intrinsics: batch.intrinsics.clone(),
-            };
-            loss(&disparities[..1], &transforms, &views, &self.loss, None).photometric
+            loss(&disparities[..1], &transforms, &views(batch), &self.loss, None).photometric
         });
         let errors: Vec<f64> = errors.collect();
         errors.iter().sum::<f64>() / errors.len().max(1) as f64
