@@ -97,6 +97,34 @@ fn wrong_settings_are_named_before_any_time_is_spent() {
 }
 
 #[test]
+fn an_output_folder_that_cannot_be_is_refused_before_the_street_is_rendered() {
+    let place = tempfile::tempdir().expect("a folder");
+    let file = place.path().join("a_file");
+    std::fs::write(&file, "mine").expect("written");
+    let inside = file.join("run");
+    let started = std::time::Instant::now();
+    fails(&["train", "--out", inside.to_str().expect("a path in UTF-8")], 1, &["a_file"]);
+    assert!(started.elapsed().as_secs() < 2, "something was rendered first");
+    assert_eq!(std::fs::read(&file).expect("there"), b"mine");
+}
+
+#[test]
+fn a_batch_larger_than_the_data_is_refused() {
+    let place = tempfile::tempdir().expect("a folder");
+    let path = |name: &str| place.path().join(name).to_str().expect("a path in UTF-8").to_owned();
+    let (street, out) = (path("street"), path("run"));
+    let size = ["--sequences", "1", "--frames", "6", "--height", "64", "--width", "96"];
+    let made = parallax(&[&["data", "street", "--out", &street][..], &size].concat());
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    let small = ["train", "--data", &street, "--preset", "pico", "--height", "64", "--width", "96", "--out", &out];
+    fails(&[&small[..], &["--batch", "5"]].concat(), 1, &["--batch", "5 samples", "holds 4"]);
+    assert!(!Path::new(&out).exists(), "nothing was made");
+    let split = path("split.txt");
+    std::fs::write(&split, "2011_09_26/no_such_drive 3 l\n").expect("written");
+    fails(&[&small[..], &["--split", &split]].concat(), 1, &["split.txt", "line 1", "no_such_drive"]);
+}
+
+#[test]
 fn a_folder_that_holds_something_is_not_written_into() {
     let place = tempfile::tempdir().expect("a folder");
     std::fs::write(place.path().join("precious.txt"), "mine").expect("written");

@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use parallax::data::Dataset;
 use parallax::data::kitti::{Kitti, Options};
 use parallax::data::street::{Street, StreetConfig};
+use parallax::data::{Dataset, Subset};
 use parallax::monovit::Preset;
 use parallax::monovit::metrics::Metrics;
 use parallax::monovit::run::{Ended, Event, Run, RunConfig, RunData, RunMetrics, read_config};
@@ -47,7 +47,7 @@ pub struct Args {
     /// How many times through the data, instead of steps.
     #[arg(long, value_name = "N")]
     epochs: Option<u64>,
-    /// The learning rate of everything.
+    /// The learning rate of the depth decoder; those of the encoder and of the pose networks keep their ratio to it.
     #[arg(long, value_name = "RATE")]
     learning_rate: Option<f64>,
     /// Everything random follows from this number.
@@ -92,12 +92,19 @@ pub fn run(args: Args) -> Result<()> {
             let mut config = configuration(&args)?;
             config.check()?;
             let folder = args.out.clone().unwrap_or_else(|| next_free("runs"));
-            let data = open(&config)?;
+            let made = !folder.exists();
+            Run::claim(&folder)?;
+            let data = open(&config).and_then(|data| enough(&data, &config).map(|()| data));
+            let data = data.inspect_err(|_| {
+                // A folder made for nothing; if it cannot go, the error above says what matters.
+                if made {
+                    let _ = std::fs::remove_dir(&folder);
+                }
+            })?;
             if let Some(epochs) = args.epochs {
                 let a_pass = data.train.len().div_ceil(config.batch.max(1)) as u64;
                 set_steps(&mut config, epochs * a_pass);
             }
-            enough(&data, &config)?;
             (Run::create(&folder, config)?, data)
         }
     };
@@ -119,9 +126,11 @@ pub fn run(args: Args) -> Result<()> {
                 let note = format!("loss {:.4} photometric {:.4} (unwarped {:.4})", r.loss, r.photometric, r.unwarped);
                 progress.set(r.step, &note);
             }
-            Event::Validated(step, error, best) => {
-                let best = if best { ", the best so far" } else { "" };
-                progress.say(&format!("step {step}: photometric error on validation data {error:.4}{best}"));
+            Event::Validated(v) => {
+                let abs_rel = v.abs_rel.map_or_else(String::new, |a| format!(", Abs Rel {a:.4}"));
+                let best = if v.best { ", the best so far" } else { "" };
+                let (step, error) = (v.step, v.photometric);
+                progress.say(&format!("step {step}: photometric error on validation data {error:.4}{best}{abs_rel}"));
             }
         },
     )?;
@@ -132,7 +141,9 @@ pub fn run(args: Args) -> Result<()> {
             eprintln!("stopped after step {step}; go on with: parallax train --resume {folder}");
         }
         Ended::Finished(None) => {
-            eprintln!("done; the data has no ground-truth depth to measure against. Look at {folder}/images");
+            eprintln!(
+                "done; no frame that was set aside has ground-truth depth to measure against. Look at {folder}/images"
+            );
         }
         Ended::Finished(Some(metrics)) => {
             if args.json {
@@ -158,7 +169,9 @@ fn print_metrics(m: &RunMetrics) {
         );
     };
     row("untrained", &m.before);
-    row("mean depth map", &m.mean_map);
+    if let Some(mean_map) = &m.mean_map {
+        row("mean depth map", mean_map);
+    }
     row("trained", &m.after);
 }
 
@@ -180,7 +193,10 @@ fn configuration(args: &Args) -> Result<RunConfig> {
         if !(rate > 0.0 && rate.is_finite()) {
             return Err(Error::setting("--learning-rate", format!("{rate} is not a number above 0")));
         }
-        (c.optim.encoder_rate, c.optim.rate) = (rate, rate);
+        let factor = rate / c.optim.rate;
+        c.optim.rate = rate;
+        c.optim.encoder_rate *= factor;
+        c.optim.pose_rate *= factor;
     }
     if let Some(steps) = args.steps {
         set_steps(&mut c, steps);
@@ -241,18 +257,21 @@ fn open(config: &RunConfig) -> Result<RunData> {
     let root = Path::new(&config.data);
     let all: Arc<dyn Dataset> =
         Arc::new(Kitti::open(root, config.split.as_deref(), height, width, Options::default())?);
-    Ok(match &config.val_split {
-        Some(split) => {
-            let validation = Arc::new(Kitti::open(root, Some(split), height, width, Options::default())?);
-            RunData { train: all, validation, test: None }
-        }
+    let (train, aside): (Arc<dyn Dataset>, Arc<dyn Dataset>) = match &config.val_split {
+        Some(split) => (all, Arc::new(Kitti::open(root, Some(split), height, width, Options::default())?)),
         None => {
             let (aside, rest) = (0..all.len()).partition(|i| i % 10 == 9);
-            RunData {
-                train: Arc::new(parallax::data::Subset::new(all.clone(), rest)),
-                validation: Arc::new(parallax::data::Subset::new(all, aside)),
-                test: None,
-            }
+            (Arc::new(Subset::new(all.clone(), rest)), Arc::new(Subset::new(all, aside)))
         }
+    };
+    // What selects the weights is not what is reported on.
+    let (validation, mut test): (Vec<usize>, Vec<usize>) = (0..aside.len()).partition(|i| i % 2 == 0);
+    let with_truth: Result<Vec<bool>> = test.iter().map(|&i| Ok(aside.depth(i)?.is_some())).collect();
+    let mut with_truth = with_truth?.into_iter();
+    test.retain(|_| with_truth.next().unwrap_or(false));
+    Ok(RunData {
+        train,
+        validation: Arc::new(Subset::new(aside.clone(), validation)),
+        test: (!test.is_empty()).then(|| Arc::new(Subset::new(aside, test)) as Arc<dyn Dataset>),
     })
 }

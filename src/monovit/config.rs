@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::nn::Start;
+
 /// Everything that decides the shapes of the four networks.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -26,6 +28,8 @@ pub struct Config {
     pub pose_width: usize,
     /// Channels of the pose decoder.
     pub pose_squeeze: usize,
+    /// How weights start.
+    pub start: Start,
 }
 
 /// A named configuration.
@@ -77,6 +81,7 @@ impl Preset {
             reduction: 16,
             pose_width: 64,
             pose_squeeze: 256,
+            start: Start::Published,
         };
         match self {
             Preset::Pico => Config {
@@ -91,6 +96,7 @@ impl Preset {
                 reduction: 8,
                 pose_width: 16,
                 pose_squeeze: 64,
+                start: Start::Uniform,
                 ..published([32, 48, 64, 96], [1, 1, 2, 1], 2)
             },
             Preset::Tiny => published([64, 96, 176, 216], [1, 2, 4, 1], 2),

@@ -77,8 +77,9 @@ struct PatchEmbedding {
 
 impl PatchEmbedding {
     fn new<T: Float>(b: &mut Builder<T>, channels: usize, stride: usize) -> Self {
+        let init = b.start(Init::he(3, channels), 9);
         PatchEmbedding {
-            depthwise: DepthwiseConv::new(&mut b.at("dwconv"), channels, 3, stride, Init::he(3, channels), false),
+            depthwise: DepthwiseConv::new(&mut b.at("dwconv"), channels, 3, stride, init, false),
             pointwise: Conv::new(&mut b.at("pwconv"), [channels; 2], 1, Conv2d::default(), ConvStart::He),
             bn: BatchNorm::new(&mut b.at("bn"), channels, Activation::Hardswish),
         }
@@ -129,7 +130,7 @@ struct InvertedResidual {
 impl InvertedResidual {
     fn new<T: Float>(b: &mut Builder<T>, channels: usize) -> Self {
         // By fan out over the groups: each output channel has its own window.
-        let init = Init::he(3, 1);
+        let init = b.start(Init::he(3, 1), 9);
         InvertedResidual {
             conv1: ConvBn::new(&mut b.at("conv1"), [channels; 2], 1, 1, Activation::Hardswish),
             depthwise: DepthwiseConv::new(&mut b.at("dwconv"), channels, 3, 1, init, false),
@@ -231,16 +232,19 @@ impl TransformerLayer {
         channels: usize,
         drop_path: f64,
     ) -> Self {
-        let init = Init::TruncatedNormal(0.02);
-        let qkv = Linear::new(&mut b.at("factoratt_crpe.qkv"), [channels, 3 * channels], init, true);
-        let proj = Linear::new(&mut b.at("factoratt_crpe.proj"), [channels; 2], init, true);
+        let linear = |b: &mut Builder<T>, [inputs, outputs]: [usize; 2]| {
+            let init = b.start(Init::TruncatedNormal(0.02), inputs);
+            Linear::new(b, [inputs, outputs], init, true)
+        };
+        let qkv = linear(&mut b.at("factoratt_crpe.qkv"), [channels, 3 * channels]);
+        let proj = linear(&mut b.at("factoratt_crpe.proj"), [channels; 2]);
         relative.alias(&mut b.at("factoratt_crpe.crpe"));
         let hidden = channels * config.mlp_ratio;
         TransformerLayer {
             qkv,
             proj,
-            fc1: Linear::new(&mut b.at("mlp.fc1"), [channels, hidden], init, true),
-            fc2: Linear::new(&mut b.at("mlp.fc2"), [hidden, channels], init, true),
+            fc1: linear(&mut b.at("mlp.fc1"), [channels, hidden]),
+            fc2: linear(&mut b.at("mlp.fc2"), [hidden, channels]),
             norm1: LayerNorm::new(&mut b.at("norm1"), channels),
             norm2: LayerNorm::new(&mut b.at("norm2"), channels),
             heads: config.heads,

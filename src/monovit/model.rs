@@ -23,7 +23,7 @@ impl MonoVit {
     /// The networks, and their parameters as they start, drawn from `seed`.
     pub fn new<T: Float>(config: Config, seed: u64) -> (Self, Params<T>) {
         let (mut params, mut random) = (Params::new(), Random::new(seed, 0x1417));
-        let b = &mut Builder::new(&mut params, &mut random);
+        let b = &mut Builder::new(&mut params, &mut random).starting(config.start);
         let model = MonoVit {
             encoder: Encoder::new(&mut b.at("encoder"), &config),
             depth: Decoder::new(&mut b.at("depth"), &config),

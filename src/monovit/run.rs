@@ -46,7 +46,8 @@ pub struct RunConfig {
     pub data: String,
     /// A split list for training; all frames without.
     pub split: Option<PathBuf>,
-    /// A split list for validation and the final metrics of a folder.
+    /// A split list for a folder: every second frame validates, the others (with ground truth) are reported on. Every
+    /// tenth training frame is set aside, without.
     pub val_split: Option<PathBuf>,
     /// Weights to start from.
     pub init: Option<PathBuf>,
@@ -87,6 +88,7 @@ impl RunConfig {
             optim: OptimConfig {
                 encoder_rate: 3e-4,
                 rate: 3e-4,
+                pose_rate: 3e-4,
                 decay: 0.01,
                 betas: [0.9, 0.999],
                 clip: 0.0,
@@ -146,8 +148,8 @@ pub struct RunMetrics {
     pub before: Metrics,
     /// The best weights.
     pub after: Metrics,
-    /// The mean depth map of the training data.
-    pub mean_map: Metrics,
+    /// The mean depth map of the training data, where its depth is known.
+    pub mean_map: Option<Metrics>,
     /// The time of the training loop, in seconds.
     pub seconds: f64,
     /// Its steps.
@@ -175,8 +177,20 @@ pub enum Event<'a> {
     Phase(&'a str),
     /// A step is done.
     Step(&'a StepReport),
-    /// Weights were validated: step, photometric error, whether they are the best so far.
-    Validated(u64, f64, bool),
+    /// Weights were validated.
+    Validated(&'a Validated),
+}
+
+/// What validation found.
+pub struct Validated {
+    /// After this step.
+    pub step: u64,
+    /// The photometric error, which the best weights are chosen by.
+    pub photometric: f64,
+    /// Whether it is the lowest so far.
+    pub best: bool,
+    /// Abs Rel with median scaling, where there is ground truth: to be seen, not to choose by.
+    pub abs_rel: Option<f64>,
 }
 
 /// How a run ended.
@@ -210,31 +224,46 @@ struct StateNotes {
 }
 
 impl Run {
-    /// A new run in an empty or missing folder.
-    pub fn create(folder: &Path, config: RunConfig) -> Result<Self> {
-        config.check()?;
-        if fs::read_dir(folder).is_ok_and(|mut entries| entries.next().is_some()) {
+    /// Makes sure that a run can be written into this folder, which is made if it is missing: to be called before
+    /// anything that takes time.
+    ///
+    /// # Errors
+    /// If the folder holds something, or cannot be written into.
+    pub fn claim(folder: &Path) -> Result<()> {
+        fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
+        let mut entries = fs::read_dir(folder).map_err(|e| Error::io(folder, e))?;
+        if entries.next().is_some() {
             let message = "is not empty: give another folder with --out, or go on with --resume";
             return Err(Error::file(folder, message));
         }
-        fs::create_dir_all(folder.join("checkpoints")).map_err(|e| Error::io(folder, e))?;
+        let probe = folder.join(".writable");
+        write_bytes_atomically(&probe, b"")?;
+        fs::remove_file(&probe).map_err(|e| Error::io(probe, e))
+    }
+
+    /// A new run in an empty or missing folder.
+    pub fn create(folder: &Path, config: RunConfig) -> Result<Self> {
+        config.check()?;
+        Self::claim(folder)?;
         let text = toml::to_string(&config).map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
         write_bytes_atomically(folder.join("config.toml"), text.as_bytes())?;
-        let mut run = Self::at(folder, config);
-        if let Some(disparity) = run.config.initial_disparity {
-            start_at(&mut run.trainer.params, disparity);
+        let (model, mut params) = MonoVit::new(config.model(), config.seed);
+        if let Some(disparity) = config.initial_disparity {
+            start_at(&mut params, disparity);
         }
-        if let Some(init) = run.config.init.clone() {
-            let contents = checkpoint::read(&init)?;
-            checkpoint::import(&mut run.trainer.params, &contents.tensors, &init)?;
+        if let Some(init) = &config.init {
+            let contents = checkpoint::read(init)?;
+            checkpoint::import(&mut params, &contents.tensors, init)?;
         }
-        Ok(run)
+        let trainer = Trainer::of(model, params, config.optim, config.loss, config.seed);
+        Ok(Self::of(folder, config, trainer))
     }
 
     /// A run that was interrupted, where it stood.
     pub fn resume(folder: &Path) -> Result<Self> {
         let config = read_config(&folder.join("config.toml"))?;
-        let mut run = Self::at(folder, config);
+        let trainer = Trainer::new(config.model(), config.optim, config.loss, config.seed);
+        let mut run = Self::of(folder, config, trainer);
         let state = run.state_file();
         run.trainer.load(&state)?;
         let notes = checkpoint::read::<f32>(&state)?.metadata.remove("run").unwrap_or_default();
@@ -254,8 +283,7 @@ impl Run {
         Ok(run)
     }
 
-    fn at(folder: &Path, config: RunConfig) -> Self {
-        let trainer = Trainer::new(config.model(), config.optim, config.loss, config.seed);
+    fn of(folder: &Path, config: RunConfig, trainer: Trainer) -> Self {
         Run { folder: folder.to_owned(), config, trainer, best: f64::INFINITY, seconds: 0.0, before: None }
     }
 
@@ -270,14 +298,18 @@ impl Run {
 
     /// Trains to the end, or until `stop` says so.
     pub fn train(&mut self, data: &RunData, stop: impl Fn() -> bool, mut tell: impl FnMut(Event)) -> Result<Ended> {
-        let how = Evaluation { protocol: Protocol::Dense, scale: Scale::Median, flip: false };
         let test: Option<(&dyn Dataset, Vec<usize>)> =
             data.test.as_deref().map(|t| (t, (0..t.len()).collect::<Vec<_>>()));
         if let (Some((test, samples)), None) = (&test, self.before) {
             tell(Event::Phase("measuring the untrained network"));
             let predictor = Predictor::new(&self.trainer.model, &self.trainer.params, &self.config.loss);
-            self.before = Some(evaluate(&predictor, *test, samples, how, |_| ())?.metrics);
+            self.before = Some(evaluate(&predictor, *test, samples, DENSE, |_| ())?.metrics);
         }
+        // Before training, so that ground truth that cannot be read costs no run.
+        let mean_map = match &test {
+            Some((test, samples)) => mean_map(data.train.as_ref(), *test, samples)?,
+            None => None,
+        };
         let validation = self.validation_batches(data)?;
         let (augment, batch, seed) = (self.config.augment, self.config.batch, self.config.seed);
         let mut loader = Loader::start(data.train.clone(), augment, batch, seed, self.trainer.steps())?;
@@ -308,7 +340,7 @@ impl Run {
             if report.step.is_multiple_of(self.config.checkpoint_every) || last || stopping {
                 self.seconds += since.elapsed().as_secs_f64();
                 if !stopping {
-                    self.keep_if_best(&validation, report.step, &mut tell)?;
+                    self.keep_if_best(data, &validation, report.step, &mut tell)?;
                 }
                 self.save()?;
                 since = Instant::now();
@@ -318,7 +350,7 @@ impl Run {
             }
         }
         drop(loader);
-        Ok(Ended::Finished(self.finish(data, test, how, &mut tell)?.map(Box::new)))
+        Ok(Ended::Finished(self.finish(data, test, mean_map, &mut tell)?.map(Box::new)))
     }
 
     /// A fixed set of batches without augmentation.
@@ -329,15 +361,27 @@ impl Run {
         (0..count).map(|step| batch_of_step(data.validation.as_ref(), plain, size, 0, step)).collect()
     }
 
-    fn keep_if_best(&mut self, validation: &[Batch], step: u64, tell: &mut impl FnMut(Event)) -> Result<()> {
+    fn keep_if_best(
+        &mut self,
+        data: &RunData,
+        batches: &[Batch],
+        step: u64,
+        tell: &mut impl FnMut(Event),
+    ) -> Result<()> {
         let weights = self.trainer.weights();
-        let error = self.trainer.validate(&weights, validation);
-        let better = error < self.best;
-        if better {
-            self.best = error;
+        let photometric = self.trainer.validate(&weights, batches);
+        let best = photometric < self.best;
+        if best {
+            self.best = photometric;
             write_weights(&self.folder.join("best.safetensors"), &weights, &self.config)?;
         }
-        tell(Event::Validated(step, error, better));
+        let samples = forty_of(data.validation.len());
+        let predictor = Predictor::new(&self.trainer.model, &weights, &self.config.loss);
+        let abs_rel = match data.validation.depth(0)? {
+            Some(_) => Some(evaluate(&predictor, data.validation.as_ref(), &samples, DENSE, |_| ())?.metrics.abs_rel),
+            None => None,
+        };
+        tell(Event::Validated(&Validated { step, photometric, best, abs_rel }));
         Ok(())
     }
 
@@ -351,7 +395,7 @@ impl Run {
         &self,
         data: &RunData,
         test: Option<(&dyn Dataset, Vec<usize>)>,
-        how: Evaluation,
+        mean_map: Option<Metrics>,
         tell: &mut impl FnMut(Event),
     ) -> Result<Option<RunMetrics>> {
         tell(Event::Phase("measuring the best weights"));
@@ -360,12 +404,11 @@ impl Run {
         let shown: &dyn Dataset = test.as_ref().map_or(data.validation.as_ref(), |(t, _)| *t);
         self.write_images(&predictor, shown)?;
         let Some((test, samples)) = test else { return Ok(None) };
-        let after = evaluate(&predictor, test, &samples, how, |_| ())?;
-        let map = MeanMap::of_dataset(data.train.as_ref())?;
+        let after = evaluate(&predictor, test, &samples, DENSE, |_| ())?;
         let metrics = RunMetrics {
             before: self.before.unwrap_or_default(),
             after: after.metrics,
-            mean_map: evaluate_mean_map(&map, test, &samples, how)?.metrics,
+            mean_map,
             seconds: self.seconds,
             steps: self.trainer.steps(),
             images: after.images,
@@ -404,6 +447,23 @@ impl Run {
         }
         Ok(())
     }
+}
+
+/// What the mean depth map of the training data is worth; nothing, if its depth is not known.
+fn mean_map(train: &dyn Dataset, test: &dyn Dataset, samples: &[usize]) -> Result<Option<Metrics>> {
+    if train.depth(0)?.is_none() {
+        return Ok(None);
+    }
+    let map = MeanMap::of_dataset(train)?;
+    Ok(Some(evaluate_mean_map(&map, test, samples, DENSE)?.metrics))
+}
+
+/// How a run measures depth: every pixel with ground truth, at the truth's median.
+const DENSE: Evaluation = Evaluation { protocol: Protocol::Dense, scale: Scale::Median, flip: false };
+
+/// At most forty samples, evenly over all.
+fn forty_of(len: usize) -> Vec<usize> {
+    (0..len).step_by(len.div_ceil(40).max(1)).collect()
 }
 
 /// Sets the biases of the disparity heads so that an input of zeros gives this disparity.

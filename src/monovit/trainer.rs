@@ -22,8 +22,11 @@ use crate::tensor::{Tape, Tensor, Var};
 pub struct OptimConfig {
     /// The learning rate of the depth encoder.
     pub encoder_rate: f64,
-    /// The learning rate of everything else.
+    /// The learning rate of the depth decoder.
     pub rate: f64,
+    /// The learning rate of the pose networks. Their output is scaled by 0.01, so at the depth's rate they follow a
+    /// hundred times as slowly.
+    pub pose_rate: f64,
     /// Decoupled weight decay, of every parameter.
     pub decay: f64,
     /// b1 and b2 of AdamW.
@@ -53,8 +56,8 @@ pub struct StepReport {
     pub smoothness: f64,
     /// The share of pixels that auto-masking leaves in.
     pub auto_mask: f64,
-    /// The learning rates: encoder, the rest.
-    pub learning_rates: [f64; 2],
+    /// The learning rates: encoder, decoder, pose networks.
+    pub learning_rates: [f64; 3],
     /// The norm of all gradients, before clipping.
     pub grad_norm: f64,
 }
@@ -147,11 +150,17 @@ impl Trainer {
             )));
         }
         let factor = self.optim.schedule.factor(step);
-        let learning_rates = [self.optim.encoder_rate * factor, self.optim.rate * factor];
+        let learning_rates = [self.optim.encoder_rate, self.optim.rate, self.optim.pose_rate].map(|r| r * factor);
         let decay = self.optim.decay;
         self.adamw.step(&mut self.params, &gradients, |name| {
-            let learning_rate = learning_rates[usize::from(!name.starts_with("encoder."))];
-            Group { learning_rate, decay }
+            let which = if name.starts_with("encoder.") {
+                0
+            } else if name.starts_with("depth.") {
+                1
+            } else {
+                2
+            };
+            Group { learning_rate: learning_rates[which], decay }
         });
         for (id, value) in c.into_moved() {
             self.params.set(id, value);

@@ -16,7 +16,8 @@ pub struct Conv {
 /// How a convolution starts, and whether it has a bias.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ConvStart {
-    /// He's normal by fan out, no bias: in front of a normalisation.
+    /// He's normal by fan out (or as the builder's [`Start`](super::Start) has it), no bias: in front of a
+    /// normalisation.
     He,
     /// Uniform within 1 / sqrt(fan in), no bias.
     FanIn,
@@ -34,8 +35,9 @@ impl Conv {
         start: ConvStart,
     ) -> Self {
         let [inputs, outputs] = channels;
-        let fan_in = Init::FanIn(inputs * kernel * kernel);
-        let init = if start == ConvStart::He { Init::he(kernel, outputs) } else { fan_in };
+        let count = inputs * kernel * kernel;
+        let fan_in = Init::FanIn(count);
+        let init = if start == ConvStart::He { b.start(Init::he(kernel, outputs), count) } else { fan_in };
         let weight = b.param("weight", [kernel, kernel, inputs, outputs], Layout::Conv, init);
         let bias = (start == ConvStart::FanInWithBias).then(|| b.param("bias", [outputs], Layout::Same, fan_in));
         Conv { weight, bias, op }

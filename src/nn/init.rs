@@ -1,5 +1,7 @@
 //! How parameters start.
 
+use serde::{Deserialize, Serialize};
+
 use crate::random::Random;
 use crate::tensor::{Float, Shape, Tensor};
 
@@ -14,6 +16,18 @@ pub enum Init {
     TruncatedNormal(f64),
     /// Uniform within 1 / sqrt(fan in), which is given.
     FanIn(usize),
+}
+
+/// Which starting values a model's layers in front of a normalisation get.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Start {
+    /// As published: He's normal, and a truncated normal of 0.02 for the transformer's linear layers.
+    #[default]
+    Published,
+    /// Uniform within 1 / sqrt(fan in), everywhere. A normalisation takes the scale of these weights out of the result,
+    /// but the smaller they are, the further a step of a given size turns them: from scratch, that is faster.
+    Uniform,
 }
 
 impl Init {

@@ -13,7 +13,7 @@ mod params;
 
 pub use context::Context;
 pub use conv::{Conv, ConvBn, ConvStart, DepthwiseConv};
-pub use init::Init;
+pub use init::{Init, Start};
 pub use linear::Linear;
 pub use norm::{BatchNorm, LayerNorm};
 pub use params::{Builder, Layout, Param, ParamId, Params};

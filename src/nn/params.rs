@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use super::init::Init;
+use super::init::{Init, Start};
 use crate::random::Random;
 use crate::tensor::{Float, Shape, Tensor};
 
@@ -158,18 +158,32 @@ pub struct Builder<'a, T: Float> {
     params: &'a mut Params<T>,
     random: &'a mut Random,
     path: String,
+    start: Start,
 }
 
 impl<'a, T: Float> Builder<'a, T> {
     /// A builder at the root.
     pub fn new(params: &'a mut Params<T>, random: &'a mut Random) -> Self {
-        Builder { params, random, path: String::new() }
+        Builder { params, random, path: String::new(), start: Start::Published }
+    }
+
+    /// The same builder with other starting values.
+    pub fn starting(self, start: Start) -> Self {
+        Builder { start, ..self }
+    }
+
+    /// How a weight with `fan_in` inputs starts, whose published start is given.
+    pub fn start(&self, published: Init, fan_in: usize) -> Init {
+        match self.start {
+            Start::Published => published,
+            Start::Uniform => Init::FanIn(fan_in),
+        }
     }
 
     /// The same builder one level deeper.
     pub fn at(&mut self, name: impl std::fmt::Display) -> Builder<'_, T> {
         let path = self.join(name);
-        Builder { params: self.params, random: self.random, path }
+        Builder { params: self.params, random: self.random, path, start: self.start }
     }
 
     fn join(&self, name: impl std::fmt::Display) -> String {
