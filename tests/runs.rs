@@ -9,6 +9,7 @@ use parallax::data::Dataset;
 use parallax::data::street::{Street, StreetConfig};
 use parallax::monovit::Preset;
 use parallax::monovit::run::{Ended, Event, Run, RunConfig, RunData};
+use parallax::monovit::shake::Shake;
 
 fn street(seed: u64) -> Arc<dyn Dataset> {
     let config = StreetConfig { height: 64, width: 96, sequences: 1, frames: 8, seed, ..StreetConfig::default() };
@@ -20,7 +21,9 @@ fn data() -> RunData {
 }
 
 fn config() -> RunConfig {
-    RunConfig { height: 64, width: 96, batch: 2, log_every: 1, checkpoint_every: 2, ..RunConfig::new(Preset::Pico, 5) }
+    let mut usual = RunConfig::new(Preset::Pico, 5);
+    usual.loss.shake = Shake { steps: 2, keep: 2, ..Shake::default() };
+    RunConfig { height: 64, width: 96, batch: 2, log_every: 1, checkpoint_every: 2, ..usual }
 }
 
 /// The log without the times.
@@ -37,6 +40,16 @@ fn log(folder: &Path) -> Vec<serde_json::Value> {
         .collect()
 }
 
+/// Trains in `folder` and is interrupted when `stop` says so of an event.
+fn interrupted(run: &mut Run, data: &RunData, stop: impl Fn(&Event) -> bool) -> u64 {
+    let stopping = std::cell::Cell::new(false);
+    let tell = |event: Event| stopping.set(stopping.get() || stop(&event));
+    match run.train(data, || stopping.get(), tell).expect("trained") {
+        Ended::Interrupted(step) => step,
+        Ended::Finished(_) => panic!("not interrupted"),
+    }
+}
+
 #[test]
 fn a_resumed_run_ends_like_one_that_never_stopped() {
     let place = tempfile::tempdir().expect("a folder");
@@ -46,15 +59,13 @@ fn a_resumed_run_ends_like_one_that_never_stopped() {
     let ended = Run::create(&whole, config()).expect("a run").train(&data, || false, |_| ()).expect("trained");
     assert!(matches!(ended, Ended::Finished(Some(_))));
 
-    let steps = std::cell::Cell::new(0);
-    let mut first = Run::create(&parts, config()).expect("a run");
-    let count = |event: Event| {
-        if let Event::Step(_) = event {
-            steps.set(steps.get() + 1);
-        }
-    };
-    let ended = first.train(&data, || steps.get() == 3, count).expect("trained");
-    assert!(matches!(ended, Ended::Interrupted(3)));
+    // Before the first step; before the first validation; and between two of them.
+    let mut run = Run::create(&parts, config()).expect("a run");
+    assert_eq!(interrupted(&mut run, &data, |e| matches!(e, Event::Rotations(1, _))), 0);
+    for at in [1, 3] {
+        let mut run = Run::resume(&parts).expect("resumed");
+        assert_eq!(interrupted(&mut run, &data, |e| matches!(e, Event::Step(r) if r.step == at)), at);
+    }
     let ended = Run::resume(&parts).expect("resumed").train(&data, || false, |_| ()).expect("trained");
     let Ended::Finished(Some(metrics)) = ended else { panic!("not finished") };
 

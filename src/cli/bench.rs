@@ -5,13 +5,15 @@ use std::time::Instant;
 
 use parallax::Result;
 use parallax::data::batch::Batch;
-use parallax::monovit::run::{RunConfig, check_size};
-use parallax::monovit::{Preset, Trainer};
+use parallax::monovit::Trainer;
+use parallax::monovit::run::RunConfig;
 use parallax::nn::Context;
 use parallax::ops::trace::{self, Entry};
 use parallax::random::Random;
 use parallax::tensor::{Tensor, Var, pool};
 use serde::Serialize;
+
+use super::sizes::Sizes;
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -22,31 +24,18 @@ pub struct Args {
 #[derive(clap::Subcommand)]
 enum What {
     /// A whole training step: four networks, four scales, the loss, backward, AdamW.
-    Step(Sizes),
+    Step(Timed),
     /// Disparities of pictures, nothing recorded.
-    Infer(Sizes),
+    Infer(Timed),
 }
 
-#[derive(clap::Args, Clone)]
-pub struct Sizes {
-    /// The size of the networks.
-    #[arg(long, default_value = "nano")]
-    preset: Preset,
-    /// Height of the pictures.
-    #[arg(long, default_value_t = 96)]
-    height: usize,
-    /// Width of the pictures.
-    #[arg(long, default_value_t = 320)]
-    width: usize,
-    /// Pictures (or triplets) at a time.
-    #[arg(long, default_value_t = 4)]
-    batch: usize,
+#[derive(clap::Args)]
+struct Timed {
+    #[command(flatten)]
+    sizes: Sizes,
     /// How often it is timed, after three times that are not counted.
-    #[arg(long, default_value_t = 10)]
+    #[arg(long, value_name = "N", default_value_t = 10)]
     iterations: usize,
-    /// Print one JSON object.
-    #[arg(long)]
-    json: bool,
 }
 
 /// Where the time goes: one op on one kernel path.
@@ -73,13 +62,15 @@ struct Timing {
 }
 
 pub fn run(args: Args) -> Result<()> {
-    let (sizes, step) = match &args.what {
-        What::Step(sizes) => (sizes, true),
-        What::Infer(sizes) => (sizes, false),
+    let (Timed { sizes, iterations }, step) = match &args.what {
+        What::Step(timed) => (timed, true),
+        What::Infer(timed) => (timed, false),
     };
-    check_size("--height", sizes.height)?;
-    check_size("--width", sizes.width)?;
-    let config = RunConfig::new(sizes.preset, 1_000_000);
+    sizes.check()?;
+    let mut config = RunConfig::new(sizes.preset, 1_000_000);
+    // The step as it is for most of the run.
+    config.loss.auto_mask_after = 0;
+    config.loss.shake.keep = 0;
     let mut trainer = Trainer::new(config.model(), config.optim, config.loss, 0);
     let batch = batch(sizes);
     let infer = |trainer: &Trainer| {
@@ -98,7 +89,7 @@ pub fn run(args: Args) -> Result<()> {
     }
     let fresh = pool::fresh_buffers();
     let mut seconds = Vec::new();
-    for _ in 0..sizes.iterations.max(1) {
+    for _ in 0..(*iterations).max(1) {
         let start = Instant::now();
         once(&mut trainer)?;
         seconds.push(start.elapsed().as_secs_f64());

@@ -1,31 +1,13 @@
 //! `parallax info`.
 
 use parallax::Result;
-use parallax::monovit::run::check_size;
-use parallax::monovit::{MonoVit, Preset};
+use parallax::monovit::MonoVit;
 use parallax::nn::Context;
 use parallax::ops::trace;
 use parallax::tensor::{Tensor, Var};
 use serde::Serialize;
 
-#[derive(clap::Args)]
-pub struct Args {
-    /// The size of the networks.
-    #[arg(long, default_value = "nano")]
-    preset: Preset,
-    /// Height of the pictures.
-    #[arg(long, default_value_t = 96)]
-    height: usize,
-    /// Width of the pictures.
-    #[arg(long, default_value_t = 320)]
-    width: usize,
-    /// Pictures at a time.
-    #[arg(long, default_value_t = 4)]
-    batch: usize,
-    /// Print one JSON object.
-    #[arg(long)]
-    json: bool,
-}
+use super::sizes::Sizes;
 
 #[derive(Serialize)]
 struct Parameters {
@@ -43,9 +25,8 @@ struct Info {
     memory_bytes: u64,
 }
 
-pub fn run(args: Args) -> Result<()> {
-    check_size("--height", args.height)?;
-    check_size("--width", args.width)?;
+pub fn run(args: Sizes) -> Result<()> {
+    args.check()?;
     let (model, params) = MonoVit::new::<f32>(args.preset.config(), 0);
     // Counted by running one picture: the arithmetic of an op is said by the op itself.
     let c = Context::inference(&params);

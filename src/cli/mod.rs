@@ -7,6 +7,7 @@ mod gradcheck;
 mod info;
 mod predict;
 mod progress;
+mod sizes;
 mod train;
 
 use std::process::ExitCode;
@@ -38,7 +39,7 @@ enum Command {
     /// Time a training step or an inference, op by op.
     Bench(bench::Args),
     /// Count parameters, arithmetic and memory before you start.
-    Info(info::Args),
+    Info(sizes::Sizes),
     /// Write the embedded street as files.
     Data(data::Args),
 }

@@ -11,8 +11,8 @@ pub struct Progress {
     plain: bool,
     what: &'static str,
     total: u64,
-    start: Instant,
-    first: Option<u64>,
+    /// When the first of them was done, and which that was: what came before is no part of the rate.
+    start: Option<(Instant, u64)>,
     last_line: Option<Instant>,
 }
 
@@ -27,20 +27,25 @@ impl Progress {
             bar.set_style(style.progress_chars("=> "));
         }
         bar.set_prefix(what);
-        Progress { bar, plain, what, total, start: Instant::now(), first: None, last_line: None }
+        Progress { bar, plain, what, total, start: None, last_line: None }
     }
 
     /// `done` of them are done; `note` stands beside.
     pub fn set(&mut self, done: u64, note: &str) {
-        let first = *self.first.get_or_insert(done.saturating_sub(1));
+        let (start, first) = *self.start.get_or_insert_with(|| {
+            self.bar.reset_elapsed();
+            self.bar.reset_eta();
+            (Instant::now(), done)
+        });
         self.bar.set_position(done);
         self.bar.set_message(note.to_owned());
         let due = self.last_line.is_none_or(|at| at.elapsed() > Duration::from_secs(10));
         if self.plain && (due || done == self.total) {
             self.last_line = Some(Instant::now());
-            let rate = (done - first) as f64 / self.start.elapsed().as_secs_f64();
-            let left = (self.total.saturating_sub(done)) as f64 / rate.max(1e-9);
-            eprintln!("{} {done}/{}  {rate:.2}/s  {left:.0} s left  {note}", self.what, self.total);
+            let rate = (done - first) as f64 / start.elapsed().as_secs_f64().max(1e-9);
+            let left = (self.total.saturating_sub(done)) as f64 / rate;
+            let rate = if done > first { format!("{rate:.2}/s  {left:.0} s left") } else { "just begun".to_owned() };
+            eprintln!("{} {done}/{}  {rate}  {note}", self.what, self.total);
         }
     }
 

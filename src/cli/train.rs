@@ -10,13 +10,12 @@ use parallax::data::{Dataset, Subset};
 use parallax::monovit::Preset;
 use parallax::monovit::metrics::Metrics;
 use parallax::monovit::run::{Ended, Event, Run, RunConfig, RunData, RunMetrics, read_config};
-use parallax::optim::Decay;
 use parallax::{Error, Result};
 
 use super::progress::Progress;
 
 /// Steps of the default run.
-const STEPS: u64 = 2000;
+const STEPS: u64 = 2300;
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -103,7 +102,7 @@ pub fn run(args: Args) -> Result<()> {
             })?;
             if let Some(epochs) = args.epochs {
                 let a_pass = data.train.len().div_ceil(config.batch.max(1)) as u64;
-                set_steps(&mut config, epochs * a_pass);
+                config.set_steps(epochs * a_pass);
             }
             (Run::create(&folder, config)?, data)
         }
@@ -122,6 +121,11 @@ pub fn run(args: Args) -> Result<()> {
         || stop.load(Ordering::SeqCst),
         |event| match event {
             Event::Phase(what) => progress.say(what),
+            Event::Rotations(step, error) => {
+                if step % 50 == 0 {
+                    progress.say(&format!("  step {step}: mean error {error:.2} pixels"));
+                }
+            }
             Event::Step(r) => {
                 let note = format!("loss {:.4} photometric {:.4} (unwarped {:.4})", r.loss, r.photometric, r.unwarped);
                 progress.set(r.step, &note);
@@ -199,19 +203,9 @@ fn configuration(args: &Args) -> Result<RunConfig> {
         c.optim.pose_rate *= factor;
     }
     if let Some(steps) = args.steps {
-        set_steps(&mut c, steps);
+        c.set_steps(steps);
     }
     Ok(c)
-}
-
-/// Sets the number of steps; a cosine ends with them, a fall comes after three quarters.
-fn set_steps(config: &mut RunConfig, count: u64) {
-    config.steps = count;
-    match &mut config.optim.schedule.decay {
-        Decay::Cosine { steps, .. } => *steps = count,
-        Decay::Step { at, .. } => *at = count / 4 * 3,
-        Decay::Constant | Decay::Exponential { .. } => {}
-    }
 }
 
 /// `runs/1`, `runs/2`, ...: the first that is not there.

@@ -3,6 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::shake::Shake;
 use crate::random::Random;
 use crate::tensor::{Float, Tensor, Var};
 
@@ -20,11 +21,16 @@ pub struct LossConfig {
     pub smoothness: f64,
     /// Whether pixels that an unwarped neighbour explains better are left out.
     pub auto_mask: bool,
+    /// The number of steps before auto-masking sets in. While the motion is not known yet, a warped neighbour explains
+    /// hardly any pixel better than an unwarped one, and masking would leave little to learn from.
+    pub auto_mask_after: u64,
     /// The deviation of the noise that decides between equal errors.
     pub tie_break: f64,
     /// Whether the sampling grid is made for the convention it is sampled with (pixel centres), instead of the
     /// published combination (made for aligned corners, sampled without).
     pub consistent_grid: bool,
+    /// Known rotations for the pose network, at the beginning; not where training starts from given weights.
+    pub shake: Shake,
 }
 
 impl Default for LossConfig {
@@ -35,8 +41,10 @@ impl Default for LossConfig {
             ssim: 0.85,
             smoothness: 1e-3,
             auto_mask: true,
+            auto_mask_after: 0,
             tie_break: 1e-5,
             consistent_grid: false,
+            shake: Shake::default(),
         }
     }
 }
@@ -106,10 +114,7 @@ pub fn loss<T: Float>(
 ) -> Loss<T> {
     let target = &views.pyramid[0];
     let [_, height, width, _] = target.shape().nhwc().expect("an image");
-    let still: Vec<Var<T>> = match config.auto_mask {
-        true => views.sources.iter().map(|s| photometric(s, target, config)).collect(),
-        false => vec![],
-    };
+    let still: Vec<Var<T>> = views.sources.iter().map(|s| photometric(s, target, config)).collect();
     let unwarped = mean_minimum(&still);
 
     let mut parts = Vec::new();
@@ -131,10 +136,12 @@ pub fn loss<T: Float>(
             .collect();
         let warped = candidates.len();
         sum_warped += mean_minimum(&candidates);
-        candidates.extend(still.iter().map(|error| match &mut ties {
-            Some((ties, random)) => Var::constant(ties.add(error.value(), random)),
-            None => error.clone(),
-        }));
+        if config.auto_mask {
+            candidates.extend(still.iter().map(|error| match &mut ties {
+                Some((ties, random)) => Var::constant(ties.add(error.value(), random)),
+                None => error.clone(),
+            }));
+        }
         let (error, winner) = Var::min_reprojection(&candidates.iter().collect::<Vec<_>>());
         let smoothness = disparity.smoothness(&views.pyramid[scale]);
         let weight = config.smoothness / (1u64 << scale) as f64;

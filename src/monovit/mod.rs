@@ -9,6 +9,7 @@ pub mod metrics;
 mod model;
 pub mod pose;
 pub mod run;
+pub mod shake;
 pub mod trainer;
 
 pub use config::{Config, Preset};

@@ -17,6 +17,7 @@ use super::evaluation::{Evaluation, Predictor, evaluate, evaluate_mean_map};
 use super::loss::LossConfig;
 use super::metrics::{MeanMap, Metrics, Protocol, Scale};
 use super::model::MonoVit;
+use super::shake::Shake;
 use super::trainer::{OptimConfig, StepReport, Trainer};
 use crate::data::Dataset;
 use crate::data::batch::{Augment, Batch, Loader, batch_of_step};
@@ -69,7 +70,7 @@ pub struct RunConfig {
 impl RunConfig {
     /// The recipe for a small network from scratch, on the embedded street.
     pub fn new(preset: Preset, steps: u64) -> Self {
-        RunConfig {
+        let mut config = RunConfig {
             preset,
             height: 96,
             width: 320,
@@ -80,22 +81,45 @@ impl RunConfig {
             split: None,
             val_split: None,
             init: None,
-            initial_disparity: None,
+            initial_disparity: Some(0.15),
             log_every: 10,
-            checkpoint_every: 250,
+            checkpoint_every: 200,
             augment: Augment { flip: true, jitter: false },
-            loss: LossConfig::default(),
+            loss: LossConfig {
+                auto_mask_after: 300,
+                consistent_grid: true,
+                shake: Shake { steps: 500, keep: 600, ..Shake::default() },
+                ..LossConfig::default()
+            },
             optim: OptimConfig {
-                encoder_rate: 3e-4,
-                rate: 3e-4,
-                pose_rate: 3e-4,
+                encoder_rate: 7e-4,
+                rate: 7e-4,
+                pose_rate: 2e-3,
                 decay: 0.01,
                 betas: [0.9, 0.999],
                 clip: 0.0,
                 average: 0.99,
-                schedule: Schedule { warm_up: 100, decay: Decay::Step { at: steps / 4 * 3, factor: 0.1 } },
+                schedule: Schedule { warm_up: 100, decay: Decay::Cosine { steps, end: 0.01 } },
             },
+        };
+        config.set_steps(steps);
+        config
+    }
+
+    /// Sets the number of steps: a cosine ends with them, a fall comes after three quarters, and what belongs to the
+    /// beginning takes no more than its share.
+    pub fn set_steps(&mut self, count: u64) {
+        self.steps = count;
+        match &mut self.optim.schedule.decay {
+            Decay::Cosine { steps, .. } => *steps = count,
+            Decay::Step { at, .. } => *at = count / 4 * 3,
+            Decay::Constant | Decay::Exponential { .. } => {}
         }
+        let shrink = |steps: &mut u64, part: u64| *steps = (*steps).min(count / part);
+        shrink(&mut self.optim.schedule.warm_up, 10);
+        shrink(&mut self.loss.shake.steps, 4);
+        shrink(&mut self.loss.shake.keep, 4);
+        shrink(&mut self.loss.auto_mask_after, 7);
     }
 
     /// The sizes of the networks.
@@ -175,6 +199,8 @@ struct LogLine {
 pub enum Event<'a> {
     /// A phase begins, in words.
     Phase(&'a str),
+    /// A step of learning rotations is done: its number, and the mean error in pixels.
+    Rotations(u64, f64),
     /// A step is done.
     Step(&'a StepReport),
     /// Weights were validated.
@@ -208,8 +234,8 @@ pub struct Run {
     /// What it runs.
     pub config: RunConfig,
     trainer: Trainer,
-    /// The photometric error of the best weights so far.
-    best: f64,
+    /// The photometric error of the best weights so far; none before the first validation.
+    best: Option<f64>,
     /// Seconds of training before this process.
     seconds: f64,
     before: Option<Metrics>,
@@ -218,7 +244,7 @@ pub struct Run {
 /// What a state file says beside the tensors.
 #[derive(Serialize, Deserialize)]
 struct StateNotes {
-    best: f64,
+    best: Option<f64>,
     seconds: f64,
     before: Option<Metrics>,
 }
@@ -242,21 +268,25 @@ impl Run {
     }
 
     /// A new run in an empty or missing folder.
-    pub fn create(folder: &Path, config: RunConfig) -> Result<Self> {
+    pub fn create(folder: &Path, mut config: RunConfig) -> Result<Self> {
         config.check()?;
         Self::claim(folder)?;
-        let text = toml::to_string(&config).map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
-        write_bytes_atomically(folder.join("config.toml"), text.as_bytes())?;
         let (model, mut params) = MonoVit::new(config.model(), config.seed);
         if let Some(disparity) = config.initial_disparity {
             start_at(&mut params, disparity);
         }
-        if let Some(init) = &config.init {
-            let contents = checkpoint::read(init)?;
-            checkpoint::import(&mut params, &contents.tensors, init)?;
+        if let Some(init) = config.init.clone() {
+            // Weights that somebody trained know rotations already.
+            config.loss.shake.steps = 0;
+            let contents = checkpoint::read(&init)?;
+            checkpoint::import(&mut params, &contents.tensors, &init)?;
         }
+        let text = toml::to_string(&config).map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
+        write_bytes_atomically(folder.join("config.toml"), text.as_bytes())?;
         let trainer = Trainer::of(model, params, config.optim, config.loss, config.seed);
-        Ok(Self::of(folder, config, trainer))
+        let run = Self::of(folder, config, trainer);
+        run.save()?;
+        Ok(run)
     }
 
     /// A run that was interrupted, where it stood.
@@ -284,7 +314,7 @@ impl Run {
     }
 
     fn of(folder: &Path, config: RunConfig, trainer: Trainer) -> Self {
-        Run { folder: folder.to_owned(), config, trainer, best: f64::INFINITY, seconds: 0.0, before: None }
+        Run { folder: folder.to_owned(), config, trainer, best: None, seconds: 0.0, before: None }
     }
 
     fn state_file(&self) -> PathBuf {
@@ -317,6 +347,24 @@ impl Run {
         let log = fs::OpenOptions::new().create(true).append(true).open(&log_path);
         let mut log = log.map_err(|e| Error::io(&log_path, e))?;
 
+        if self.trainer.steps() == 0 && self.config.loss.shake.steps > 0 {
+            tell(Event::Phase("teaching the pose network what a rotation looks like"));
+            let started = Instant::now();
+            // The same frames as in training, in another order.
+            let mut loader = Loader::start(data.train.clone(), augment, batch, seed ^ u64::MAX, 0)?;
+            let learnt = self.trainer.learn_rotations(
+                || loader.next_batch(),
+                |step, error| {
+                    tell(Event::Rotations(step, error));
+                    !stop()
+                },
+            )?;
+            if !learnt {
+                // The state on disk is that before the first of these steps: they will be taken again.
+                return Ok(Ended::Interrupted(0));
+            }
+            self.seconds += started.elapsed().as_secs_f64();
+        }
         tell(Event::Phase("training"));
         let (mut since, mut waited, mut counted) = (Instant::now(), 0.0, 0u32);
         while self.trainer.steps() < self.config.steps {
@@ -370,9 +418,9 @@ impl Run {
     ) -> Result<()> {
         let weights = self.trainer.weights();
         let photometric = self.trainer.validate(&weights, batches);
-        let best = photometric < self.best;
+        let best = self.best.is_none_or(|b| photometric < b);
         if best {
-            self.best = photometric;
+            self.best = Some(photometric);
             write_weights(&self.folder.join("best.safetensors"), &weights, &self.config)?;
         }
         let samples = forty_of(data.validation.len());

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::config::Config;
 use super::loss::{Loss, LossConfig, TieBreak, Views, loss};
 use super::model::MonoVit;
+use super::shake::Lesson;
 use crate::data::batch::Batch;
 use crate::error::{Error, Result};
 use crate::nn::{Context, Params, checkpoint};
@@ -104,6 +105,25 @@ impl Trainer {
         Trainer { model, params, optim, loss, adamw, average, ties, seed }
     }
 
+    /// Teaches the pose network known rotations, before the first step; `tell` hears of every step and its error in
+    /// pixels, and says whether to go on. Whether it came to the end.
+    pub fn learn_rotations(
+        &mut self,
+        mut next_batch: impl FnMut() -> Result<Batch>,
+        mut tell: impl FnMut(u64, f64) -> bool,
+    ) -> Result<bool> {
+        let shake = self.loss.shake;
+        let mut lesson = Lesson::new(shake, &self.params, self.seed);
+        for step in 1..=shake.steps {
+            let error = lesson.step(&self.model, &mut self.params, &next_batch()?);
+            if !tell(step, error) {
+                return Ok(false);
+            }
+        }
+        self.average = (self.optim.average > 0.0).then(|| Average::new(&self.params, self.optim.average));
+        Ok(true)
+    }
+
     /// Steps taken.
     pub fn steps(&self) -> u64 {
         self.adamw.steps
@@ -122,7 +142,8 @@ impl Trainer {
         let disparities = self.model.disparities(&c, &target);
         let transforms = self.model.transforms(&c, &prev, &target, &next);
         let mut random = Random::new(self.seed, TIE_STREAM.wrapping_add(step));
-        let found = loss(&disparities, &transforms, &views(batch), &self.loss, Some((&self.ties, &mut random)));
+        let config = LossConfig { auto_mask: self.loss.auto_mask && step >= self.loss.auto_mask_after, ..self.loss };
+        let found = loss(&disparities, &transforms, &views(batch), &config, Some((&self.ties, &mut random)));
         (c, found)
     }
 
@@ -138,7 +159,11 @@ impl Trainer {
         if !total.is_finite() {
             return Err(self.explain(step, batch));
         }
-        let mut all = found.total.backward();
+        let objective = match self.loss.shake.term(step - 1, &self.model, &c, batch, self.seed) {
+            Some(term) => &found.total + term,
+            None => found.total.clone(),
+        };
+        let mut all = objective.backward();
         let mut gradients = c.gradients(&mut all);
         let bound = if self.optim.clip > 0.0 { self.optim.clip } else { f64::INFINITY };
         let grad_norm = clip_norm(&mut gradients, bound);

@@ -58,6 +58,64 @@ impl<O: CustomOp> Registered for O {
 }
 
 /// An op with gradient-check cases. There is no default: an op without cases does not build.
+///
+/// This builds:
+///
+/// ```
+/// # use parallax::ops::{registry::Entry, Case, Checked, CustomOp, Input, Needs, Op, ShapeError};
+/// # use parallax::tensor::{Float, GradSink, Shape, Tensor, Upstream};
+/// #[derive(Clone)]
+/// struct Identity;
+/// impl CustomOp for Identity { const NAME: &'static str = "identity"; }
+/// impl Checked for Identity { fn cases() -> Vec<Case<Self>> { vec![Case::new("any", Identity, [Input::random("x", [3])])] } }
+/// impl<T: Float> Op<T> for Identity {
+///     // ...
+/// #   type Saved = ();
+/// #   fn shape(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError> { Ok(vec![inputs[0]]) }
+/// #   fn forward(&self, x: &[&Tensor<T>], _: &Needs) -> (Vec<Tensor<T>>, ()) { (vec![x[0].clone()], ()) }
+/// #   fn backward(&self, _: (), upstream: Upstream<T>, sink: &mut GradSink<T>) { sink.give(0, upstream.only()); }
+/// }
+/// let entry = Entry::of::<Identity>();
+/// assert_eq!(entry.cases().len(), 1);
+/// ```
+///
+/// The same without its cases does not:
+///
+/// ```compile_fail
+/// # use parallax::ops::{registry::Entry, Case, Checked, CustomOp, Input, Needs, Op, ShapeError};
+/// # use parallax::tensor::{Float, GradSink, Shape, Tensor, Upstream};
+/// #[derive(Clone)]
+/// struct Identity;
+/// impl CustomOp for Identity { const NAME: &'static str = "identity"; }
+/// impl<T: Float> Op<T> for Identity {
+///     // ...
+/// #   type Saved = ();
+/// #   fn shape(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError> { Ok(vec![inputs[0]]) }
+/// #   fn forward(&self, x: &[&Tensor<T>], _: &Needs) -> (Vec<Tensor<T>>, ()) { (vec![x[0].clone()], ()) }
+/// #   fn backward(&self, _: (), upstream: Upstream<T>, sink: &mut GradSink<T>) { sink.give(0, upstream.only()); }
+/// }
+/// let entry = Entry::of::<Identity>();
+/// assert_eq!(entry.cases().len(), 1);
+/// ```
+///
+/// Nor does it without a name, which ops of this crate get from their line in the registry:
+///
+/// ```compile_fail
+/// # use parallax::ops::{registry::Entry, Case, Checked, CustomOp, Input, Needs, Op, ShapeError};
+/// # use parallax::tensor::{Float, GradSink, Shape, Tensor, Upstream};
+/// #[derive(Clone)]
+/// struct Identity;
+/// impl Checked for Identity { fn cases() -> Vec<Case<Self>> { vec![Case::new("any", Identity, [Input::random("x", [3])])] } }
+/// impl<T: Float> Op<T> for Identity {
+///     // ...
+/// #   type Saved = ();
+/// #   fn shape(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError> { Ok(vec![inputs[0]]) }
+/// #   fn forward(&self, x: &[&Tensor<T>], _: &Needs) -> (Vec<Tensor<T>>, ()) { (vec![x[0].clone()], ()) }
+/// #   fn backward(&self, _: (), upstream: Upstream<T>, sink: &mut GradSink<T>) { sink.give(0, upstream.only()); }
+/// }
+/// let entry = Entry::of::<Identity>();
+/// assert_eq!(entry.cases().len(), 1);
+/// ```
 pub trait Checked: Sized {
     /// Inputs on which the gradient is compared with finite differences: every kernel path, every input perturbed.
     fn cases() -> Vec<Case<Self>>;

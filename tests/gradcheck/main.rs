@@ -3,3 +3,4 @@
 mod every_op;
 mod model_path;
 mod modes;
+mod whole_model;

@@ -1,0 +1,36 @@
+//! The flags that say what is run: shared by the commands that need no data.
+
+use parallax::Result;
+use parallax::monovit::Preset;
+use parallax::monovit::run::check_size;
+
+#[derive(clap::Args, Clone)]
+pub struct Sizes {
+    /// The size of the networks.
+    #[arg(long, default_value = "nano")]
+    pub preset: Preset,
+    /// Height of the pictures, a multiple of 32.
+    #[arg(long, value_name = "PIXELS", default_value_t = 96)]
+    pub height: usize,
+    /// Width of the pictures, a multiple of 32.
+    #[arg(long, value_name = "PIXELS", default_value_t = 320)]
+    pub width: usize,
+    /// Pictures (or triplets) at a time.
+    #[arg(long, value_name = "N", default_value_t = 4)]
+    pub batch: usize,
+    /// Print one JSON object.
+    #[arg(long)]
+    pub json: bool,
+}
+
+impl Sizes {
+    /// Whether the networks can be run at these sizes.
+    pub fn check(&self) -> Result<()> {
+        check_size("--height", self.height)?;
+        check_size("--width", self.width)?;
+        if self.batch == 0 {
+            return Err(parallax::Error::setting("--batch", "at least 1"));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,69 @@
+//! The whole of a small MonoViT and its loss, in f64: by the slope of the Taylor remainder along random directions.
+
+use parallax::data::batch::{Augment, Batch, batch_of_step};
+use parallax::data::street::{Street, StreetConfig};
+use parallax::gradcheck::taylor_slope;
+use parallax::monovit::loss::{LossConfig, Views, loss};
+use parallax::monovit::{MonoVit, Preset};
+use parallax::nn::{Context, Params};
+use parallax::random::Random;
+use parallax::tensor::{Tape, Tensor, Var};
+
+fn total(model: &MonoVit, params: &Params<f64>, tape: &Tape<f64>, batch: &Batch) -> (Context<f64>, Var<f64>) {
+    let constant = |t: &Tensor<f32>| Var::constant(t.cast::<f64>());
+    let c = Context::training(params, tape, Random::new(0, 0));
+    let [prev, target, next] = batch.seen.each_ref().map(constant);
+    let views = Views {
+        pyramid: batch.pyramid.iter().map(constant).collect(),
+        sources: batch.sources.iter().map(constant).collect(),
+        intrinsics: batch.intrinsics.clone(),
+    };
+    let disparities = model.disparities(&c, &target);
+    let transforms = model.transforms(&c, &prev, &target, &next);
+    let total = loss(&disparities, &transforms, &views, &LossConfig::default(), None).total;
+    (c, total)
+}
+
+/// A random direction over every parameter that is learnt under `prefix`: a ten-thousandth of ordinary weights.
+fn direction(params: &Params<f64>, prefix: &str, seed: u64) -> Vec<Option<Tensor<f64>>> {
+    let mut random = Random::new(seed, 0xD1);
+    let mut draw = |like: &Tensor<f64>| {
+        Tensor::build(*like.shape(), |out| out.iter_mut().for_each(|x| *x = 1e-5 * random.normal()))
+    };
+    params.iter().map(|(_, p)| (p.learnt && p.name().starts_with(prefix)).then(|| draw(&p.value))).collect()
+}
+
+fn moved(params: &Params<f64>, direction: &[Option<Tensor<f64>>], h: f64) -> Params<f64> {
+    let mut moved = params.clone();
+    for ((id, _), d) in params.iter().zip(direction) {
+        if let Some(d) = d {
+            moved.value_mut(id).data_mut().iter_mut().zip(d.data()).for_each(|(w, d)| *w += h * d);
+        }
+    }
+    moved
+}
+
+#[test]
+fn the_taylor_remainder_of_the_whole_loss_falls_with_the_square_of_the_step() {
+    let config = StreetConfig { height: 64, width: 96, sequences: 1, frames: 5, ..StreetConfig::default() };
+    let street = Street::render(&config, None);
+    let batch = batch_of_step(&street, Augment { flip: false, jitter: false }, 1, 0, 0).expect("a batch");
+    let (model, params) = MonoVit::new::<f64>(Preset::Pico.config(), 3);
+    let tape = Tape::new();
+    let (c, found) = total(&model, &params, &tape, &batch);
+    let gradients = c.gradients(&mut found.backward());
+    for (seed, prefix) in ["encoder.", "depth.", "pose_encoder.", "pose.", ""].into_iter().enumerate() {
+        let d = direction(&params, prefix, seed as u64);
+        let along = |(g, d): (&Option<Tensor<f64>>, &Option<Tensor<f64>>)| match (g, d) {
+            (Some(g), Some(d)) => g.data().iter().zip(d.data()).map(|(g, d)| g * d).sum(),
+            _ => 0.0,
+        };
+        let derivative: f64 = gradients.iter().zip(&d).map(along).sum();
+        let at = |h: f64| total(&model, &moved(&params, &d, h), &Tape::new(), &batch).1.value().item();
+        let right = taylor_slope(at, derivative, [1.0, 0.1]);
+        let wrong = taylor_slope(at, 1.05 * derivative, [1.0, 0.1]);
+        println!("{prefix:14} derivative {derivative:+.2e}, slope {right:.2}; with a gradient off by 5 %: {wrong:.2}");
+        assert!(right > 1.8, "{prefix}: slope {right}");
+        assert!(wrong < 1.5, "{prefix}: a wrong gradient has slope {wrong}");
+    }
+}
