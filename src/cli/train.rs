@@ -15,7 +15,7 @@ use parallax::{Error, Result};
 use super::progress::Progress;
 
 /// Steps of the default run.
-const STEPS: u64 = 2300;
+const STEPS: u64 = 2000;
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -93,18 +93,20 @@ pub fn run(args: Args) -> Result<()> {
             let folder = args.out.clone().unwrap_or_else(|| next_free("runs"));
             let made = !folder.exists();
             Run::claim(&folder)?;
-            let data = open(&config).and_then(|data| enough(&data, &config).map(|()| data));
-            let data = data.inspect_err(|_| {
+            let prepared = open(&config).and_then(|data| {
+                enough(&data, &config)?;
+                if let Some(epochs) = args.epochs {
+                    let a_pass = data.train.len().div_ceil(config.batch.max(1)) as u64;
+                    config.set_steps(epochs * a_pass);
+                }
+                Ok((Run::create(&folder, config)?, data))
+            });
+            prepared.inspect_err(|_| {
                 // A folder made for nothing; if it cannot go, the error above says what matters.
                 if made {
                     let _ = std::fs::remove_dir(&folder);
                 }
-            })?;
-            if let Some(epochs) = args.epochs {
-                let a_pass = data.train.len().div_ceil(config.batch.max(1)) as u64;
-                config.set_steps(epochs * a_pass);
-            }
-            (Run::create(&folder, config)?, data)
+            })?
         }
     };
     eprintln!(

@@ -29,6 +29,7 @@ fn scaled(gradients: &Gradients, input: usize, factor: f64) -> Gradients {
 fn every_gradient_agrees_with_finite_differences_and_no_changed_one_does() {
     let mut failures = Vec::new();
     let mut table: BTreeMap<&str, Row> = BTreeMap::new();
+    let mut only_kinks = 0;
     for entry in registry::all() {
         for case in entry.cases() {
             let (case, options) = (case.as_ref(), options_of(case.as_ref(), 1));
@@ -46,10 +47,15 @@ fn every_gradient_agrees_with_finite_differences_and_no_changed_one_does() {
 
             // The comparison itself: a gradient that is off by ten times the tolerance, or missing, must not pass.
             for &i in &tracked {
-                if report.inputs[i].as_ref().is_none_or(|r| r.scale == 0.0) {
-                    continue;
-                }
-                for (how, factor) in [("scaled", 1.0 + 10.0 * options.tolerance), ("dropped", 0.0)] {
+                let Some(input) = report.inputs[i].as_ref().filter(|r| r.scale > 0.0) else { continue };
+                // Where every derivative that is not zero stands on a kink there is no finite difference to scale it
+                // against; that it is missing is still seen.
+                let off_kinks = |(k, g): (usize, &f64)| *g != 0.0 && !input.kinks.contains(&k);
+                let gradient = analytic.inputs[i].as_ref().expect("tracked");
+                let comparable = gradient.data().iter().enumerate().any(off_kinks);
+                only_kinks += usize::from(!comparable);
+                let scale = if comparable { 1.0 + 10.0 * options.tolerance } else { 0.0 };
+                for (how, factor) in [("scaled", scale), ("dropped", 0.0)] {
                     row.tampered += 1;
                     let report = Report::new(&scaled(&analytic, i, factor), &numeric, &options);
                     if report.failure().is_none() {
@@ -62,6 +68,10 @@ fn every_gradient_agrees_with_finite_differences_and_no_changed_one_does() {
     for (op, Row { cases, error, tampered }) in &table {
         println!("{op:32} {cases:3} cases  {error:.1e}  {tampered:3} changed gradients caught");
     }
+    assert_eq!(
+        only_kinks, 4,
+        "inputs whose every derivative stands on a kink: ties of max, min, pooling, reprojection"
+    );
     assert!(failures.is_empty(), "{} failures:\n{}", failures.len(), failures.join("\n"));
 }
 
@@ -101,4 +111,4 @@ fn exceptions_are_counted() {
 }
 
 /// Elements on kinks, cases with a loosened tolerance, inputs that are declared not differentiable.
-const EXCEPTIONS: (usize, usize, usize) = (0, 0, 0);
+const EXCEPTIONS: (usize, usize, usize) = (36, 2, 3);
