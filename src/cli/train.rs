@@ -15,7 +15,7 @@ use parallax::{Error, Result};
 use super::progress::Progress;
 
 /// Steps of the default run.
-const STEPS: u64 = 2000;
+const STEPS: u64 = 2600;
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -245,7 +245,7 @@ fn open(config: &RunConfig) -> Result<RunData> {
         // Seeds far apart: three worlds that have no street in common.
         let seed = config.seed;
         return Ok(RunData {
-            train: street("street", seed, 40),
+            train: street("street", seed, 64),
             validation: street("validation", seed + 1_000_000, 4),
             test: Some(street("test", seed + 2_000_000, 8)),
         });
