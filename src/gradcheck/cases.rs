@@ -1,12 +1,16 @@
 //! The check of an op's case.
 
-use super::{Options, Report, check};
+use std::fmt;
+
+use serde::Serialize;
+
+use super::{Kinks, Options, Report, Tolerance, check};
 use crate::ops::registry::AnyCase;
 use crate::random::Random;
 use crate::tensor::{Tensor, Var};
 
 /// What the check of one case found.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize)]
 pub struct CaseReport {
     /// The op.
     pub op: &'static str,
@@ -18,6 +22,12 @@ pub struct CaseReport {
     pub report: Report,
 }
 
+impl fmt::Display for CaseReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} [{}] \"{}\"\n{}", self.op, self.algo, self.case, self.report)
+    }
+}
+
 /// The inputs of a case, drawn from a seed.
 pub fn draw(case: &dyn AnyCase, seed: u64) -> Vec<Tensor<f64>> {
     let mut random = Random::new(seed, 0xCA5E);
@@ -26,11 +36,16 @@ pub fn draw(case: &dyn AnyCase, seed: u64) -> Vec<Tensor<f64>> {
 
 /// What a case says of its own check.
 pub fn options_of(case: &dyn AnyCase, seed: u64) -> Options {
+    let numbers = |f: &dyn Fn(&crate::ops::Input) -> bool| {
+        case.inputs().iter().enumerate().filter(|(_, input)| f(input)).map(|(i, _)| i).collect()
+    };
     Options {
-        tolerance: case.tolerance(),
-        kinks: case.kinks(),
-        constant: (0..case.inputs().len()).filter(|&i| case.inputs()[i].constant.is_some()).collect(),
+        tolerance: Tolerance::OfLargest(case.tolerance()),
+        kinks: Kinks::Exactly(case.kinks()),
+        constant: numbers(&|input| input.constant.is_some()),
+        ignored: numbers(&|input| input.ignored),
         flat: case.flat(),
+        names: case.inputs().iter().map(|input| input.name.to_string()).collect(),
         seed,
         ..Options::default()
     }

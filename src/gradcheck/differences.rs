@@ -1,34 +1,84 @@
-//! The numeric side: finite differences, one coordinate after the other.
+//! The numeric side: finite differences, one movement of the inputs after the other.
 
+use std::collections::BTreeMap;
+
+use super::options::{Options, Stencil};
+use crate::random::Random;
 use crate::tensor::{Tensor, Var};
 
-/// The difference quotients of one input, element by element.
-#[derive(Clone, Debug)]
-pub struct Differences {
-    /// (f(x + h) - f(x - h)) / 2h: exact up to h^2.
-    pub central: Vec<f64>,
-    /// (f(x + h) - f(x)) / h.
-    pub right: Vec<f64>,
+/// The quotients along one movement of the inputs, met with the cotangents.
+#[derive(Clone, Copy, Debug)]
+pub struct Quotient {
+    /// From both sides, as the stencil says.
+    pub central: f64,
     /// (f(x) - f(x - h)) / h.
-    pub left: Vec<f64>,
+    pub left: f64,
+    /// (f(x + h) - f(x)) / h.
+    pub right: f64,
+    /// The least value that a derivative can have if each output takes either of its one-sided ones.
+    pub low: f64,
+    /// The greatest.
+    pub high: f64,
 }
 
-impl Differences {
-    /// The elements where the one-sided quotients disagree, beside a gradient of the given size.
+impl Quotient {
+    /// Whether the one-sided quotients disagree, beside a gradient of the given size.
     ///
     /// A smooth function's differ by its curvature times the step; at a kink they differ by the jump of the slope.
-    pub fn kinks(&self, scale: f64) -> Vec<usize> {
-        let apart = |&k: &usize| {
-            let (right, left) = (self.right[k], self.left[k]);
-            (right - left).abs() > 1e-2 * scale.max(left.abs()).max(right.abs())
-        };
-        (0..self.central.len()).filter(apart).collect()
+    pub fn is_kink(&self, scale: f64) -> bool {
+        let scale = scale.max(self.left.abs()).max(self.right.abs());
+        let apart = |a: f64, b: f64| (a - b).abs() > 1e-2 * scale;
+        apart(self.left, self.right) || apart(self.low, self.high)
     }
 }
 
-/// The difference quotients of `f`, met with `cotangents`, for every tracked input; `None` for the others.
+/// How one input was moved, and what came of it.
+#[derive(Clone, Debug)]
+pub struct Differences {
+    /// The directions: element `k` alone is direction `k`, without.
+    pub directions: Option<Vec<Vec<f64>>>,
+    /// The quotient along each.
+    pub quotients: Vec<Quotient>,
+}
+
+impl Differences {
+    /// The derivatives along the same directions that a gradient promises.
+    pub(super) fn along(&self, gradient: &[f64]) -> Vec<f64> {
+        match &self.directions {
+            None => gradient.to_vec(),
+            Some(all) => all.iter().map(|d| d.iter().zip(gradient).map(|(d, g)| d * g).sum()).collect(),
+        }
+    }
+
+    /// The largest quotient.
+    fn scale(&self) -> f64 {
+        self.quotients.iter().fold(0.0, |m, q| m.max(q.central.abs()))
+    }
+}
+
+/// Elements of equal value, each on a kink by itself, that were moved together.
 ///
-/// The step is `step` times max(1, |x|).
+/// Where several numbers tie, none of them has a derivative, but all of them together do: a maximum of three equal
+/// numbers rises as fast as they all do. So their gradients have a sum that can be checked.
+#[derive(Clone, Debug)]
+pub struct Tie {
+    /// (input, element) of each.
+    pub members: Vec<(usize, usize)>,
+    /// The quotient along their common movement.
+    pub quotient: Quotient,
+}
+
+/// The whole numeric side.
+#[derive(Clone, Debug)]
+pub struct Measured {
+    /// For every input that is differentiated.
+    pub inputs: Vec<Option<Differences>>,
+    /// The ties among their kinks, where they have a derivative together.
+    pub ties: Vec<Tie>,
+}
+
+/// The difference quotients of `f`, met with `cotangents` (one an output; `None` for outputs that are not
+/// differentiated), for every input in `tracked`.
 ///
 /// # Errors
 /// If the outputs have other shapes than the cotangents.
@@ -37,8 +87,8 @@ pub fn differences(
     inputs: &[Tensor<f64>],
     tracked: &[usize],
     cotangents: &[Option<Tensor<f64>>],
-    step: f64,
-) -> Result<Vec<Option<Differences>>, String> {
+    options: &Options,
+) -> Result<Measured, String> {
     let evaluate = |inputs: &[Tensor<f64>]| -> Vec<Tensor<f64>> {
         let constants: Vec<_> = inputs.iter().cloned().map(Var::constant).collect();
         f(&constants).into_iter().map(Var::into_value).collect()
@@ -48,40 +98,111 @@ pub fn differences(
     if centre.len() != cotangents.len() || !centre.iter().zip(cotangents).all(fits) {
         return Err("the outputs have other shapes when nothing is tracked".into());
     }
+    let prober = Prober { evaluate, inputs, centre, cotangents, options };
     let mut found = vec![None; inputs.len()];
     for &i in tracked {
         let n = inputs[i].len();
-        let mut moved = inputs.to_vec();
-        let mut d =
-            Differences { central: Vec::with_capacity(n), right: Vec::with_capacity(n), left: Vec::with_capacity(n) };
-        for k in 0..n {
-            let x = inputs[i].data()[k];
-            let h = step * x.abs().max(1.0);
-            // The step that is really taken, after rounding.
-            let (up, down) = (x + h, x - h);
-            moved[i].data_mut()[k] = up;
-            let above = evaluate(&moved);
-            moved[i].data_mut()[k] = down;
-            let below = evaluate(&moved);
-            moved[i].data_mut()[k] = x;
-            d.right.push(slope(&above, &centre, cotangents, up - x));
-            d.left.push(slope(&centre, &below, cotangents, x - down));
-            d.central.push(slope(&above, &below, cotangents, up - down));
-        }
-        found[i] = Some(d);
+        let directions = options.directions.filter(|&count| count < n).map(|count| {
+            let mut random = Random::new(options.seed, 0xD12 + i as u64);
+            let mut draw = |_| (0..n).map(|_| random.normal() / (n as f64).sqrt()).collect::<Vec<f64>>();
+            (0..count).map(&mut draw).collect::<Vec<_>>()
+        });
+        let quotients = match &directions {
+            None => (0..n).map(|k| prober.probe(&[(i, k, 1.0)])).collect(),
+            Some(all) => {
+                let movement = |d: &Vec<f64>| d.iter().enumerate().map(|(k, &d)| (i, k, d)).collect::<Vec<_>>();
+                all.iter().map(|d| prober.probe(&movement(d))).collect()
+            }
+        };
+        found[i] = Some(Differences { directions, quotients });
     }
-    Ok(found)
+    let ties = ties(&prober, &found);
+    Ok(Measured { inputs: found, ties })
 }
 
-/// The difference of two outputs, met with the cotangents, over the step.
-fn slope(above: &[Tensor<f64>], below: &[Tensor<f64>], cotangents: &[Option<Tensor<f64>>], step: f64) -> f64 {
-    let mut sum = 0.0;
-    for ((a, b), c) in above.iter().zip(below).zip(cotangents) {
-        if let Some(c) = c {
-            // An infinity that does not move has no slope of its own, and must not become NaN.
-            let difference = |(&a, &b): (&f64, &f64)| if a == b { 0.0 } else { a - b };
-            sum += a.data().iter().zip(b.data()).map(difference).zip(c.data()).map(|(d, c)| d * c).sum::<f64>();
+/// Moves inputs and looks at what the outputs do.
+struct Prober<'a, F> {
+    evaluate: F,
+    inputs: &'a [Tensor<f64>],
+    centre: Vec<Tensor<f64>>,
+    cotangents: &'a [Option<Tensor<f64>>],
+    options: &'a Options,
+}
+
+impl<F: Fn(&[Tensor<f64>]) -> Vec<Tensor<f64>>> Prober<'_, F> {
+    /// The quotient along a movement: (input, element, how far) of each element that moves.
+    fn probe(&self, movement: &[(usize, usize, f64)]) -> Quotient {
+        let largest = movement.iter().fold(1.0, |m: f64, &(i, k, _)| m.max(self.inputs[i].data()[k].abs()));
+        let mut h = self.options.step * largest;
+        if let [(i, k, _)] = *movement {
+            // The step that is really taken, after rounding.
+            let x = self.inputs[i].data()[k];
+            h = (x + h) - x;
+        }
+        let at = |h: f64| {
+            let mut moved = self.inputs.to_vec();
+            movement.iter().for_each(|&(i, k, far)| moved[i].data_mut()[k] += h * far);
+            (self.evaluate)(&moved)
+        };
+        let (above, below) = (at(h), at(-h));
+        let mut q = Quotient { central: 0.0, left: 0.0, right: 0.0, low: 0.0, high: 0.0 };
+        for_each_number(self.cotangents, [&above, &self.centre, &below], |c, [above, centre, below]| {
+            let (right, left) = (c * change(above, centre) / h, c * change(centre, below) / h);
+            q.central += c * change(above, below) / (2.0 * h);
+            q.right += right;
+            q.left += left;
+            q.low += right.min(left);
+            q.high += right.max(left);
+        });
+        if self.options.stencil == Stencil::FivePoint {
+            let (far_above, far_below) = (at(2.0 * h), at(-2.0 * h));
+            let mut far = 0.0;
+            for_each_number(self.cotangents, [&far_above, &self.centre, &far_below], |c, [above, _, below]| {
+                far += c * change(above, below) / (4.0 * h);
+            });
+            q.central += (q.central - far) / 3.0;
+        }
+        q
+    }
+}
+
+/// a - b; an infinity that does not move has no slope of its own, and must not become NaN.
+fn change(a: f64, b: f64) -> f64 {
+    if a == b { 0.0 } else { a - b }
+}
+
+fn for_each_number(cotangents: &[Option<Tensor<f64>>], outputs: [&[Tensor<f64>]; 3], mut f: impl FnMut(f64, [f64; 3])) {
+    for (o, c) in cotangents.iter().enumerate() {
+        let Some(c) = c else { continue };
+        for (k, &c) in c.data().iter().enumerate() {
+            // One-hot cotangents are mostly zeros.
+            if c != 0.0 {
+                f(c, outputs.map(|y| y[o].data()[k]));
+            }
         }
     }
-    sum / step
+}
+
+/// Moves elements of equal value that stand on kinks together, and keeps the groups that have a derivative so.
+fn ties<F: Fn(&[Tensor<f64>]) -> Vec<Tensor<f64>>>(prober: &Prober<F>, found: &[Option<Differences>]) -> Vec<Tie> {
+    let mut groups: BTreeMap<u64, Vec<(usize, usize)>> = BTreeMap::new();
+    let mut scale = 0.0;
+    for (i, differences) in found.iter().enumerate() {
+        let Some(differences) = differences.as_ref().filter(|d| d.directions.is_none()) else { continue };
+        scale = differences.scale().max(scale);
+        for (k, q) in differences.quotients.iter().enumerate() {
+            if q.is_kink(differences.scale()) {
+                // 0 and -0 are equal.
+                groups.entry((prober.inputs[i].data()[k] + 0.0).to_bits()).or_default().push((i, k));
+            }
+        }
+    }
+    let groups = groups.into_values().filter(|members| members.len() > 1);
+    groups
+        .map(|members| {
+            let movement: Vec<_> = members.iter().map(|&(i, k)| (i, k, 1.0)).collect();
+            Tie { quotient: prober.probe(&movement), members }
+        })
+        .filter(|tie| !tie.quotient.is_kink(scale))
+        .collect()
 }

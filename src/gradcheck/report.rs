@@ -1,15 +1,22 @@
 //! What a check found, and whether that will do.
 
-use super::differences::Differences;
-use super::{Gradients, Options};
-use crate::tensor::Tensor;
+use std::fmt;
+
+use serde::Serialize;
+
+use super::Gradients;
+use super::differences::{Differences, Measured};
+use super::options::{Kinks, Options};
 
 /// What the check of one input found.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize)]
 pub struct InputReport {
-    /// max |analytic - numeric| / max |analytic|, kinks left out.
+    /// Its name, or its number.
+    pub name: String,
+    /// |analytic - numeric| at the worst element, over the largest analytic derivative (over 1 if that is 0). Kinks are
+    /// left out.
     pub error: f64,
-    /// The element where they differ most.
+    /// The element (or direction) where they differ most, beside what is allowed there.
     pub worst: usize,
     /// The analytic derivative there.
     pub analytic: f64,
@@ -17,27 +24,71 @@ pub struct InputReport {
     pub numeric: f64,
     /// The largest analytic derivative.
     pub scale: f64,
-    /// Elements compared.
+    /// Derivatives compared.
     pub elements: usize,
-    /// Elements at a kink.
+    /// Elements at a kink: they are held between their one-sided derivatives.
     pub kinks: Vec<usize>,
+    /// Whether every difference is within the tolerance.
+    pub within: bool,
+    /// An element at a kink whose analytic value is none of its one-sided ones, nor between them.
+    pub outside: Option<Outside>,
+}
+
+/// An analytic value that a kink does not allow.
+#[derive(Clone, Debug, Serialize)]
+pub struct Outside {
+    /// The element.
+    pub element: usize,
+    /// Its analytic derivative.
+    pub analytic: f64,
+    /// The least that it may be.
+    pub low: f64,
+    /// The greatest.
+    pub high: f64,
 }
 
 impl InputReport {
-    fn new(gradient: &Tensor<f64>, differences: &Differences) -> Self {
-        let scale = gradient.data().iter().fold(0.0, |m: f64, g| if g.is_nan() { f64::NAN } else { m.max(g.abs()) });
-        let kinks = differences.kinks(scale);
-        let mut r =
-            InputReport { error: 0.0, worst: 0, analytic: 0.0, numeric: 0.0, scale, elements: gradient.len(), kinks };
-        for (k, (&a, &n)) in gradient.data().iter().zip(&differences.central).enumerate() {
-            if r.kinks.contains(&k) {
-                continue;
-            }
-            // Where the analytic gradient is zero throughout, the numeric one is held to the same size as an absolute
-            // error.
-            let error = (a - n).abs() / if scale > 0.0 { scale } else { 1.0 };
-            if error.is_nan() || error > r.error {
-                (r.error, r.worst, r.analytic, r.numeric) = (error, k, a, n);
+    /// `rows` are the gradient of the input and its differences, for each cotangent.
+    fn new(name: String, rows: &[(&[f64], &Differences)], options: &Options) -> Self {
+        let largest = |m: f64, g: &f64| if g.is_nan() || m.is_nan() { f64::NAN } else { m.max(g.abs()) };
+        let analytic: Vec<Vec<f64>> = rows.iter().map(|(g, d)| d.along(g)).collect();
+        let scale = analytic.iter().flatten().fold(0.0, largest);
+        let measured = |m: f64, d: &&Differences| d.quotients.iter().fold(m, |m, q| m.max(q.central.abs()));
+        let size = rows.iter().map(|(_, d)| d).fold(0.0, measured);
+        let mut r = InputReport {
+            name,
+            error: 0.0,
+            worst: 0,
+            analytic: 0.0,
+            numeric: 0.0,
+            scale,
+            elements: 0,
+            kinks: vec![],
+            within: true,
+            outside: None,
+        };
+        let mut share = 0.0;
+        for (analytic, (_, differences)) in analytic.iter().zip(rows) {
+            for (k, (&a, q)) in analytic.iter().zip(&differences.quotients).enumerate() {
+                r.elements += 1;
+                if q.is_kink(size) {
+                    if !r.kinks.contains(&k) {
+                        r.kinks.push(k);
+                    }
+                    // One-sided quotients are off by half the curvature times the step.
+                    let slack = 1e-3 * size.max(q.left.abs()).max(q.right.abs());
+                    if !(q.low - slack..=q.high + slack).contains(&a) {
+                        r.outside = Some(Outside { element: k, analytic: a, low: q.low, high: q.high });
+                    }
+                    continue;
+                }
+                let apart = (a - q.central).abs();
+                let part = apart / options.tolerance.allowed(q.central, scale);
+                if part.is_nan() || part > share {
+                    (share, r.worst, r.analytic, r.numeric) = (part, k, a, q.central);
+                    r.error = apart / if scale > 0.0 { scale } else { 1.0 };
+                    r.within &= part <= 1.0;
+                }
             }
         }
         r
@@ -45,35 +96,46 @@ impl InputReport {
 }
 
 /// What a check found.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize)]
 pub struct Report {
     /// For each input; `None` for constants.
     pub inputs: Vec<Option<InputReport>>,
-    /// The options it was made with.
-    pub options: Options,
-    /// What made comparison impossible, if anything did.
-    pub broken: Option<String>,
+    /// Groups of tied elements whose derivatives were compared in sum.
+    pub ties: usize,
+    failure: Option<String>,
 }
 
 impl Report {
     /// Compares gradients with differences, input by input.
-    pub fn new(gradients: &Gradients, differences: &[Option<Differences>], options: &Options) -> Self {
-        let inputs = gradients.inputs.iter().zip(differences);
-        let inputs = inputs.map(|(g, d)| Some(InputReport::new(g.as_ref()?, d.as_ref()?))).collect();
-        Report { inputs, options: options.clone(), broken: None }
+    pub fn new(gradients: &Gradients, measured: &Measured, options: &Options) -> Self {
+        Self::of_rows(&[(gradients, measured)], options)
+    }
+
+    /// The same for several cotangents, each with its gradients and differences.
+    pub(super) fn of_rows(rows: &[(&Gradients, &Measured)], options: &Options) -> Self {
+        let count = rows.first().map_or(0, |(g, _)| g.inputs.len());
+        let input = |i: usize| {
+            let pairs = rows.iter().map(|(g, m)| Some((g.inputs[i].as_ref()?.data(), m.inputs[i].as_ref()?)));
+            Some(InputReport::new(options.name(i), &pairs.collect::<Option<Vec<_>>>()?, options))
+        };
+        let inputs: Vec<_> = (0..count).map(input).collect();
+        let ties = rows.iter().map(|(_, m)| m.ties.len()).sum();
+        let mut report = Report { inputs, ties, failure: None };
+        report.failure = report.judge(rows, options);
+        report
     }
 
     /// A report that says only why nothing could be compared.
-    pub(super) fn broken(options: &Options, why: impl Into<String>) -> Self {
-        Report { inputs: vec![], options: options.clone(), broken: Some(why.into()) }
+    pub(super) fn broken(why: impl Into<String>) -> Self {
+        Report { inputs: vec![], ties: 0, failure: Some(why.into()) }
     }
 
     /// The largest error of any input.
     pub fn error(&self) -> f64 {
-        self.inputs.iter().flatten().map(|i| i.error).fold(0.0, f64::max)
+        self.inputs.iter().flatten().map(|i| i.error).fold(0.0, |m: f64, e| if e.is_nan() { e } else { m.max(e) })
     }
 
-    /// The number of elements compared.
+    /// The number of derivatives compared.
     pub fn elements(&self) -> usize {
         self.inputs.iter().flatten().map(|i| i.elements).sum()
     }
@@ -84,30 +146,100 @@ impl Report {
     }
 
     /// What is wrong, in a sentence; `None` if nothing is.
-    pub fn failure(&self) -> Option<String> {
-        if let Some(why) = &self.broken {
-            return Some(why.clone());
+    pub fn failure(&self) -> Option<&str> {
+        self.failure.as_deref()
+    }
+
+    fn judge(&self, rows: &[(&Gradients, &Measured)], options: &Options) -> Option<String> {
+        let inputs = || self.inputs.iter().enumerate().filter_map(|(i, r)| Some((i, r.as_ref()?)));
+        if inputs().all(|(_, r)| r.elements == 0) && !options.flat {
+            return Some("nothing was compared: no input that is differentiated has an element".into());
         }
-        for (i, input) in self.inputs.iter().enumerate() {
-            let Some(r) = input else { continue };
-            if r.error.is_nan() || r.error > self.options.tolerance {
+        for (_, r) in inputs() {
+            let name = &r.name;
+            if !r.within {
                 return Some(format!(
-                    "input {i}, element {}: analytic {:e}, numeric {:e}, error {:.1e} of {:.1e} allowed",
-                    r.worst, r.analytic, r.numeric, r.error, self.options.tolerance
+                    "{name}, {} {}: analytic {:e}, numeric {:e}: {:.1e} apart, {:.1e} of the largest",
+                    if options.directions.is_some() { "element or direction" } else { "element" },
+                    r.worst,
+                    r.analytic,
+                    r.numeric,
+                    (r.analytic - r.numeric).abs(),
+                    r.error,
+                ));
+            }
+            if let Some(Outside { element, analytic, low, high }) = r.outside {
+                return Some(format!(
+                    "{name}, element {element}, at a kink: analytic {analytic:e} is not between {low:e} and {high:e}, \
+                     the one-sided derivatives"
                 ));
             }
         }
-        if self.kinks() != self.options.kinks {
-            let at: Vec<_> = self.inputs.iter().flatten().map(|i| &i.kinks).collect();
-            return Some(format!("{} elements at a kink, {} were declared: {at:?}", self.kinks(), self.options.kinks));
+        for (gradients, measured) in rows {
+            for tie in &measured.ties {
+                let gradient = |&(i, k): &(usize, usize)| gradients.inputs[i].as_ref().map_or(0.0, |g| g.data()[k]);
+                let sum: f64 = tie.members.iter().map(gradient).sum();
+                let expected = tie.quotient.central;
+                let scale = tie.members.iter().map(gradient).fold(expected.abs(), |m, g| m.max(g.abs()));
+                let apart = (sum - expected).abs();
+                // NaN is not within anything.
+                if apart.is_nan() || apart > options.tolerance.allowed(expected, scale) {
+                    let members = &tie.members;
+                    return Some(format!(
+                        "the tied elements {members:?} (input, element) have derivatives that sum to {sum:e}; together \
+                         they have {expected:e}"
+                    ));
+                }
+            }
         }
-        let zero = self.inputs.iter().flatten().all(|r| r.scale == 0.0);
-        if zero != self.options.flat {
-            return Some(match zero {
-                true => "every gradient is zero: nothing was checked".into(),
-                false => "a gradient is not zero, though declared flat".into(),
-            });
+        if let Kinks::Exactly(declared) = options.kinks
+            && self.kinks() != declared
+        {
+            let at: Vec<_> = inputs().filter(|(_, r)| !r.kinks.is_empty()).map(|(_, r)| (&r.name, &r.kinks)).collect();
+            return Some(format!("{} elements at a kink, {declared} were declared: {at:?}", self.kinks()));
         }
-        None
+        let mut zero = inputs().filter(|(_, r)| r.scale == 0.0).peekable();
+        if options.flat {
+            let count = inputs().count();
+            return (zero.count() < count).then(|| "a gradient is not zero, though declared flat".into());
+        }
+        if inputs().all(|(_, r)| r.scale == 0.0) {
+            return Some("every gradient is zero: nothing was checked".into());
+        }
+        let ignored = zero.find(|(i, r)| r.elements > 0 && !options.ignored.contains(i));
+        ignored.map(|(_, r)| {
+            format!("{}: every derivative is zero: the function ignores it; declare it so if that is right", r.name)
+        })
+    }
+}
+
+/// The table that a person reads.
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if !self.inputs.is_empty() {
+            writeln!(
+                f,
+                "{:20} {:>8} {:>6} {:>8} {:>13} {:>13} {:>9} {:>9}",
+                "input", "elements", "kinks", "worst", "analytic", "numeric", "absolute", "relative"
+            )?;
+        }
+        for r in self.inputs.iter().flatten() {
+            let apart = (r.analytic - r.numeric).abs();
+            writeln!(
+                f,
+                "{:20} {:8} {:6} {:>8} {:13.5e} {:13.5e} {apart:9.1e} {:9.1e}",
+                r.name,
+                r.elements,
+                r.kinks.len(),
+                r.worst,
+                r.analytic,
+                r.numeric,
+                r.error
+            )?;
+        }
+        match &self.failure {
+            Some(why) => write!(f, "WRONG: {why}"),
+            None => write!(f, "right"),
+        }
     }
 }

@@ -17,6 +17,8 @@ pub struct Input {
     pub fill: Fill,
     /// Why it is not differentiated, if so.
     pub constant: Option<&'static str>,
+    /// Whether its gradient may rightly be zero in this case, though others are not.
+    pub ignored: bool,
 }
 
 /// What an input is filled with.
@@ -53,7 +55,7 @@ pub enum Fill {
 
 impl Input {
     fn new(name: &'static str, shape: impl Into<Shape>, fill: Fill) -> Self {
-        Input { name, shape: shape.into(), fill, constant: None }
+        Input { name, shape: shape.into(), fill, constant: None, ignored: false }
     }
 
     /// Uniform random numbers in [-1, 1].
@@ -90,6 +92,12 @@ impl Input {
     /// The same input, declared not differentiable, with the reason.
     pub fn constant(mut self, reason: &'static str) -> Self {
         self.constant = Some(reason);
+        self
+    }
+
+    /// The same input, whose gradient may rightly be zero in this case though others are not.
+    pub fn ignored(mut self) -> Self {
+        self.ignored = true;
         self
     }
 
@@ -132,8 +140,10 @@ pub struct Case<O> {
     pub tolerance: f64,
     /// Why the tolerance is looser than [`TOLERANCE`], if it is.
     pub reason: Option<&'static str>,
-    /// How many elements sit exactly on a kink, where only the documented one-sided value can be asked for.
+    /// How many elements sit exactly on a kink, where the function has no derivative.
     pub kinks: usize,
+    /// An input, and its gradient for cotangents of one: what the op documents, as on its kinks.
+    pub promise: Option<(usize, Vec<f64>)>,
     /// Whether all gradients are zero here, and rightly so.
     pub flat: bool,
 }
@@ -141,7 +151,16 @@ pub struct Case<O> {
 impl<O> Case<O> {
     /// A case at the usual tolerance.
     pub fn new(name: &'static str, op: O, inputs: impl Into<Vec<Input>>) -> Self {
-        Case { name, op, inputs: inputs.into(), tolerance: TOLERANCE, reason: None, kinks: 0, flat: false }
+        Case {
+            name,
+            op,
+            inputs: inputs.into(),
+            tolerance: TOLERANCE,
+            reason: None,
+            kinks: 0,
+            promise: None,
+            flat: false,
+        }
     }
 
     /// Allows a larger error, for a reason that is printed.
@@ -151,9 +170,15 @@ impl<O> Case<O> {
         self
     }
 
-    /// Says that this many elements sit on a kink.
+    /// Says that this many elements sit on a kink; which value the op has there is [promised](Case::promises).
     pub fn kinks(mut self, count: usize) -> Self {
         self.kinks = count;
+        self
+    }
+
+    /// Says what the gradient of an input is for cotangents of one.
+    pub fn promises(mut self, input: usize, gradient: impl Into<Vec<f64>>) -> Self {
+        self.promise = Some((input, gradient.into()));
         self
     }
 

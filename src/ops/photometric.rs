@@ -76,7 +76,10 @@ impl Checked for Photometric {
             Case::new("tile less one", op(0.85, 5), images([2, 4, 3, 3])),
             Case::new("a whole tile", op(0.85, 4), images([2, 4, 3, 3])),
             Case::new("tile and one", op(0.85, 3), images([2, 4, 3, 3])),
-            Case::new("equal images", op(0.0, 0), [equal("prediction"), equal("target")]).kinks(8).flat(),
+            Case::new("equal images", op(0.0, 0), [equal("prediction"), equal("target")])
+                .kinks(8)
+                .flat()
+                .promises(0, [0.0; 4]),
         ]
     }
 }

@@ -173,7 +173,9 @@ impl Checked for MaxPool2d {
             Case::new("3 by 1", op(3, 1, 1), [x(&[1, 4, 5, 17])]),
             Case::new("2 by 3, gaps", op(2, 3, 0), [x(&[2, 5, 8, 1])]),
             Case::new("below zero", op(3, 2, 1), [Input::uniform("x", [1, 3, 4, 1], -2.0, -1.0)]),
-            Case::new("a tie", op(2, 2, 0), [Input::values("x", [1, 2, 2, 1], [1.0, 1.0, 1.0, 1.0])]).kinks(4),
+            Case::new("a tie", op(2, 2, 0), [Input::values("x", [1, 2, 2, 1], [1.0, 1.0, 1.0, 1.0])])
+                .kinks(4)
+                .promises(0, [1.0, 0.0, 0.0, 0.0]),
             Case::new("no image", op(3, 2, 1), [x(&[0, 3, 3, 2])]).flat(),
         ]
     }

@@ -1,5 +1,7 @@
 //! The registry: every op of this crate, by name. One line each; what is not here does not build.
 
+use std::any::Any;
+
 use super::case::{Case, Input};
 use super::op::{Op, Registered};
 use super::*;
@@ -111,10 +113,16 @@ pub trait AnyCase {
     fn reason(&self) -> Option<&'static str>;
     /// How many elements sit on a kink.
     fn kinks(&self) -> usize;
+    /// An input and its gradient for cotangents of one, where the case promises it.
+    fn promise(&self) -> Option<(usize, &[f64])>;
     /// Whether every gradient is rightly zero.
     fn flat(&self) -> bool;
     /// How many of the outputs, at the end, are not differentiated.
     fn auxiliary(&self) -> usize;
+    /// The shapes of all its outputs.
+    fn outputs(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError>;
+    /// The [`Case`] itself, for who knows its op.
+    fn as_any(&self) -> &dyn Any;
     /// Runs the op in f64.
     fn run(&self, inputs: &[&Var<f64>]) -> Vec<Var<f64>>;
     /// Runs the op in f32.
@@ -144,8 +152,17 @@ impl<O: Op<f64> + Op<f32>> AnyCase for Case<O> {
     fn kinks(&self) -> usize {
         self.kinks
     }
+    fn promise(&self) -> Option<(usize, &[f64])> {
+        self.promise.as_ref().map(|(input, gradient)| (*input, &gradient[..]))
+    }
     fn flat(&self) -> bool {
         self.flat
+    }
+    fn outputs(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError> {
+        Op::<f64>::shape(&self.op, inputs)
+    }
+    fn as_any(&self) -> &dyn Any {
+        self
     }
     fn auxiliary(&self) -> usize {
         Op::<f64>::auxiliary(&self.op)

@@ -90,7 +90,9 @@ impl Function for Relu {
     fn cases() -> Vec<Case<Unary<Self>>> {
         vec![
             Case::new("both sides", Unary(Relu), [Input::away("x", [3, 4, 5], -2.0, 2.0, &[0.0])]),
-            Case::new("exactly 0", Unary(Relu), [Input::values("x", [3], [0.0, -1.0, 1.0])]).kinks(1),
+            Case::new("exactly 0", Unary(Relu), [Input::values("x", [3], [0.0, -1.0, 1.0])])
+                .kinks(1)
+                .promises(0, [0.0, 0.0, 1.0]),
         ]
     }
 }
@@ -168,7 +170,9 @@ impl Function for Hardswish {
     fn cases() -> Vec<Case<Unary<Self>>> {
         vec![
             Case::new("three pieces", Unary(Hardswish), [Input::away("x", [4, 4, 5], -5.0, 5.0, &[-3.0, 3.0])]),
-            Case::new("at the joints", Unary(Hardswish), [Input::values("x", [3], [-3.0, 3.0, 0.0])]).kinks(2),
+            Case::new("at the joints", Unary(Hardswish), [Input::values("x", [3], [-3.0, 3.0, 0.0])])
+                .kinks(2)
+                .promises(0, [0.0, 1.0, 0.5]),
         ]
     }
 }
@@ -290,7 +294,9 @@ impl Function for Abs {
     fn cases() -> Vec<Case<Unary<Self>>> {
         vec![
             Case::new("both sides", Unary(Abs), [Input::away("x", [3, 4, 5], -2.0, 2.0, &[0.0])]),
-            Case::new("exactly 0", Unary(Abs), [Input::values("x", [3], [0.0, -1.0, 1.0])]).kinks(1),
+            Case::new("exactly 0", Unary(Abs), [Input::values("x", [3], [0.0, -1.0, 1.0])])
+                .kinks(1)
+                .promises(0, [0.0, -1.0, 1.0]),
         ]
     }
 }
@@ -359,7 +365,9 @@ impl Function for Clamp {
         let op = Unary(Clamp { low: -0.5, high: 1.0 });
         vec![
             Case::new("three pieces", op, [Input::away("x", [3, 4, 5], -2.0, 2.0, &[-0.5, 1.0])]),
-            Case::new("on the bounds", op, [Input::values("x", [3], [-0.5, 1.0, 0.0])]).kinks(2),
+            Case::new("on the bounds", op, [Input::values("x", [3], [-0.5, 1.0, 0.0])])
+                .kinks(2)
+                .promises(0, [1.0, 1.0, 1.0]),
             Case::new("all outside", op, [Input::uniform("x", [4], 2.0, 3.0)]).flat(),
         ]
     }

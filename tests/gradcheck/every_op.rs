@@ -1,19 +1,20 @@
-//! Every case of every op: analytic gradient against central differences in f64; and whether the comparison would have
-//! seen a wrong one.
+//! Every check on every case of every op; whether the comparison with finite differences would have seen a wrong
+//! gradient; and what the suite lets pass, counted.
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use parallax::gradcheck::{Gradients, Report, differences, draw, gradients, options_of};
+use parallax::gradcheck::{Gradients, Report, check_case};
 use parallax::ops::case::TOLERANCE;
 use parallax::ops::registry;
-use parallax::tensor::Var;
+
+use crate::checks::{CHECKS, Subject};
 
 /// A row of the table that the suite prints.
 #[derive(Default)]
 struct Row {
     cases: usize,
     error: f64,
-    tampered: usize,
+    changed: usize,
 }
 
 /// The same gradients, with that of one input multiplied.
@@ -26,53 +27,54 @@ fn scaled(gradients: &Gradients, input: usize, factor: f64) -> Gradients {
 }
 
 #[test]
-fn every_gradient_agrees_with_finite_differences_and_no_changed_one_does() {
+fn every_op_passes_every_check_and_no_changed_gradient_does() {
+    let _turn = crate::take_turns();
     let mut failures = Vec::new();
     let mut table: BTreeMap<&str, Row> = BTreeMap::new();
-    let mut only_kinks = 0;
     for entry in registry::all() {
         for case in entry.cases() {
-            let (case, options) = (case.as_ref(), options_of(case.as_ref(), 1));
-            let what = format!("{} [{}] \"{}\"", case.op(), case.algo(), case.name());
-            let inputs = draw(case, 1);
-            let run = |vars: &[Var<f64>]| case.run(&vars.iter().collect::<Vec<_>>());
-            let analytic = gradients(run, &inputs, &options).unwrap_or_else(|| panic!("{what}: nothing is tracked"));
-            let tracked: Vec<usize> = (0..inputs.len()).filter(|i| analytic.inputs[*i].is_some()).collect();
-            let numeric = differences(run, &inputs, &tracked, &analytic.cotangents, options.step)
-                .unwrap_or_else(|why| panic!("{what}: {why}"));
-            let report = Report::new(&analytic, &numeric, &options);
+            let subject = Subject::new(case.as_ref());
+            for (name, check) in CHECKS {
+                failures.extend(check(&subject).err().map(|why| format!("{}, {name}: {why}", subject.what())));
+            }
+            let (analytic, report) = (subject.gradients(), subject.report());
             let row = table.entry(entry.name).or_default();
             (row.cases, row.error) = (row.cases + 1, row.error.max(report.error()));
-            failures.extend(report.failure().map(|why| format!("{what}: {why}")));
 
             // The comparison itself: a gradient that is off by ten times the tolerance, or missing, must not pass.
-            for &i in &tracked {
-                let Some(input) = report.inputs[i].as_ref().filter(|r| r.scale > 0.0) else { continue };
-                // Where every derivative that is not zero stands on a kink there is no finite difference to scale it
-                // against; that it is missing is still seen.
-                let off_kinks = |(k, g): (usize, &f64)| *g != 0.0 && !input.kinks.contains(&k);
-                let gradient = analytic.inputs[i].as_ref().expect("tracked");
-                let comparable = gradient.data().iter().enumerate().any(off_kinks);
-                only_kinks += usize::from(!comparable);
-                let scale = if comparable { 1.0 + 10.0 * options.tolerance } else { 0.0 };
-                for (how, factor) in [("scaled", scale), ("dropped", 0.0)] {
-                    row.tampered += 1;
-                    let report = Report::new(&scaled(&analytic, i, factor), &numeric, &options);
-                    if report.failure().is_none() {
-                        failures.push(format!("{what}: a {how} gradient of input {i} passes"));
+            for (i, input) in report.inputs.iter().enumerate() {
+                if input.as_ref().is_none_or(|r| r.scale == 0.0) {
+                    continue;
+                }
+                for (how, factor) in [("scaled", 1.0 + 10.0 * case.tolerance()), ("dropped", 0.0)] {
+                    row.changed += 1;
+                    let changed = scaled(&analytic, i, factor);
+                    if Report::new(&changed, subject.measured(), &subject.options).failure().is_none() {
+                        failures.push(format!("{}: a {how} gradient of input {i} passes", subject.what()));
                     }
                 }
             }
         }
     }
-    for (op, Row { cases, error, tampered }) in &table {
-        println!("{op:32} {cases:3} cases  {error:.1e}  {tampered:3} changed gradients caught");
+    for (op, Row { cases, error, changed }) in &table {
+        println!("{op:32} {cases:3} cases  {error:.1e}  {changed:3} changed gradients caught");
     }
-    assert_eq!(
-        only_kinks, 4,
-        "inputs whose every derivative stands on a kink: ties of max, min, pooling, reprojection"
-    );
     assert!(failures.is_empty(), "{} failures:\n{}", failures.len(), failures.join("\n"));
+}
+
+/// Other inputs, other cotangents: what is right must not depend on the draw.
+#[test]
+fn twenty_seeds_raise_no_false_alarm() {
+    let mut failures = Vec::new();
+    for seed in 100..120 {
+        for case in registry::all().iter().flat_map(|e| e.cases()) {
+            let found = check_case(case.as_ref(), seed);
+            if let Some(why) = found.report.failure() {
+                failures.push(format!("seed {seed}, {} [{}] \"{}\": {why}", found.op, found.algo, found.case));
+            }
+        }
+    }
+    assert!(failures.is_empty(), "{} false alarms:\n{}", failures.len(), failures.join("\n"));
 }
 
 #[test]
@@ -88,6 +90,9 @@ fn every_op_has_cases_and_every_input_is_perturbed_somewhere() {
             let declared = uses().all(|i| i.constant.is_some_and(|reason| !reason.is_empty()));
             assert!(perturbed || declared, "{}: input {name} is perturbed in no case", entry.name);
         }
+        for case in cases.iter().filter(|c| c.kinks() > 0) {
+            assert!(case.promise().is_some(), "{} \"{}\": which value at its kinks?", entry.name, case.name());
+        }
     }
 }
 
@@ -95,6 +100,7 @@ fn every_op_has_cases_and_every_input_is_perturbed_somewhere() {
 #[test]
 fn exceptions_are_counted() {
     let (mut kinks, mut loosened, mut constants) = (BTreeMap::new(), BTreeMap::new(), BTreeSet::new());
+    let mut ignored = 0;
     for case in registry::all().iter().flat_map(|e| e.cases()) {
         if case.kinks() > 0 {
             *kinks.entry(case.op()).or_insert(0) += case.kinks();
@@ -104,11 +110,13 @@ fn exceptions_are_counted() {
             *loosened.entry(case.op()).or_insert(0) += 1;
         }
         constants.extend(case.inputs().iter().filter(|i| i.constant.is_some()).map(|i| (case.op(), i.name)));
+        ignored += case.inputs().iter().filter(|i| i.ignored).count();
     }
-    println!("kinks {kinks:?}\nloosened tolerances {loosened:?}\nnot differentiated {constants:?}");
-    let found = (kinks.values().sum::<usize>(), loosened.values().sum::<usize>(), constants.len());
-    assert_eq!(found, EXCEPTIONS, "elements on kinks, cases with a loosened tolerance, inputs not differentiated");
+    println!("kinks {kinks:?}\nloosened tolerances {loosened:?}\nnot differentiated {constants:?}\nignored {ignored}");
+    let found = [kinks.values().sum::<usize>(), loosened.values().sum::<usize>(), constants.len(), ignored];
+    assert_eq!(found, EXCEPTIONS, "kinks, cases with a loosened tolerance, inputs not differentiated, inputs ignored");
 }
 
-/// Elements on kinks, cases with a loosened tolerance, inputs that are declared not differentiable.
-const EXCEPTIONS: (usize, usize, usize) = (36, 2, 3);
+/// Elements on kinks, cases with a loosened tolerance, inputs that are declared not differentiable, inputs whose
+/// gradient is rightly zero in a case.
+const EXCEPTIONS: [usize; 4] = [36, 2, 3, 44];

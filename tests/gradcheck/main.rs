@@ -1,6 +1,18 @@
 //! The gradient-check suite: loops over the registry, so that nobody has to remember anything.
+//!
+//! `checks` is what every case must pass, `every_op` runs it over the registry, `mutants` over gradients that are wrong
+//! on purpose.
 
+mod checks;
 mod every_op;
 mod model_path;
-mod modes;
+mod mutants;
 mod whole_model;
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+/// Poisoned memory is a switch of the whole process: the tests that turn it take turns.
+fn take_turns() -> MutexGuard<'static, ()> {
+    static TURN: Mutex<()> = Mutex::new(());
+    TURN.lock().unwrap_or_else(PoisonError::into_inner)
+}
