@@ -2,7 +2,7 @@
 //!
 //! cargo run --release --example check_your_own_op
 
-use parallax::gradcheck::{Options, check, check_case};
+use parallax::gradcheck::{Cotangents, Options, check, check_case, taylor};
 use parallax::ops::registry::Entry;
 use parallax::ops::{Case, Checked, CustomOp, Input, Needs, Op, ShapeError, apply1};
 use parallax::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
@@ -47,16 +47,32 @@ fn main() {
     // The cases that stand with the op.
     for (what, entry) in [("right", Entry::of::<Cube<3>>()), ("wrong", Entry::of::<Cube<2>>())] {
         for case in entry.cases() {
-            let found = check_case(case.as_ref(), 1);
-            let verdict = found.report.failure().unwrap_or_else(|| format!("error {:.1e}", found.report.error()));
-            println!("{what}: {} [{}] \"{}\": {verdict}", found.op, found.algo, found.case);
+            println!("{what}: {}\n", check_case(case.as_ref(), 1));
         }
     }
 
     // Any function of variables, without an op of its own.
+    const STEPS: [f64; 2] = [1e-2, 1e-3];
     let f = |v: &[Var<f64>]| vec![apply1(Cube::<3>, &[&v[0]]).sigmoid() * &v[1]];
+    let g = |v: &[Var<f64>]| vec![apply1(Cube::<2>, &[&v[0]]).sigmoid() * &v[1]];
     let inputs = [Tensor::from_vec([2], vec![0.5, -1.5]), Tensor::from_vec([2], vec![2.0, 3.0])];
-    let report = check(f, &inputs, &Options::default());
-    println!("composed: {} elements, error {:.1e}", report.elements(), report.error());
+    let names = vec!["x".to_string(), "factor".to_string()];
+    let options = Options { names, ..Options::default() };
+    let report = check(f, &inputs, &options);
+    println!("composed: {report}\n");
     assert!(report.failure().is_none());
+
+    // The whole Jacobian, an output at a time; and without a step: the remainder falls with the square of the distance
+    // where the gradient is right, and with the distance itself where it is wrong.
+    let jacobian = check(f, &inputs, &Options { cotangents: Cotangents::OneHot, ..options.clone() });
+    assert!(jacobian.failure().is_none());
+    for (what, slope) in
+        [("right", taylor(f, &inputs, &options, STEPS)), ("wrong", taylor(g, &inputs, &options, STEPS))]
+    {
+        println!("{what}: slope of the Taylor remainder {:.2}", slope.expect("the output is tracked"));
+    }
+
+    // It does not take silence for success.
+    let forgetful = check(|v: &[Var<f64>]| vec![v[0].detach() * &v[1]], &inputs, &options);
+    println!("\na detached factor: {}", forgetful.failure().expect("it is noticed"));
 }

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-use parallax::gradcheck::check_case;
+use parallax::gradcheck::{CaseReport, check_case};
 use parallax::ops::registry;
 use parallax::{Error, Result};
 use serde::Serialize;
@@ -37,6 +37,8 @@ struct Row {
 struct Table {
     ops: Vec<Row>,
     failed: usize,
+    /// The whole report of every case that failed.
+    failures: Vec<CaseReport>,
 }
 
 pub fn run(args: Args) -> Result<()> {
@@ -46,7 +48,7 @@ pub fn run(args: Args) -> Result<()> {
         let names: Vec<_> = registry::all().iter().map(|e| e.name).collect();
         return Err(Error::setting("--op", format!("there is no such op; there are {}", names.join(", "))));
     }
-    let mut table = Table { ops: Vec::new(), failed: 0 };
+    let mut table = Table { ops: Vec::new(), failed: 0, failures: Vec::new() };
     for entry in chosen {
         let mut rows: BTreeMap<&str, Row> = BTreeMap::new();
         for case in entry.cases() {
@@ -66,9 +68,10 @@ pub fn run(args: Args) -> Result<()> {
             row.kinks += found.report.kinks();
             row.max_error = row.max_error.max(found.report.error());
             row.milliseconds += start.elapsed().as_secs_f64() * 1e3;
-            if let Some(why) = found.report.failure() {
+            if found.report.failure().is_some() {
                 table.failed += 1;
-                eprintln!("{} [{}] \"{}\": {why}", found.op, found.algo, found.case);
+                eprintln!("{found}\n");
+                table.failures.push(found);
             }
         }
         table.ops.extend(rows.into_values());

@@ -1,12 +1,16 @@
 //! The gradient-check suite: loops over the registry, so that nobody has to remember anything.
 //!
 //! `checks` is what every case must pass, `every_op` runs it over the registry, `mutants` over gradients that are wrong
-//! on purpose.
+//! on purpose. `regressions` are bugs of other libraries with the inputs that exposed them (`CATALOGUE.md` lists them),
+//! `regimes` whole ranges of sizes and geometries; `model_path` and `whole_model` hold the network to the ops.
 
+mod catalogue;
 mod checks;
 mod every_op;
 mod model_path;
 mod mutants;
+mod regimes;
+mod regressions;
 mod whole_model;
 
 use std::sync::{Mutex, MutexGuard, PoisonError};

@@ -52,10 +52,10 @@ pub(crate) const FASTEST: f64 = 1.0;
 const LANE: f64 = 1.0;
 
 /// The path of a car for `frames` frames: 0.5 to 1 m a frame with slow changes of speed, gentle steering that holds the
-/// lane, and a little pitch. With `keep_right` it stays off the oncoming traffic.
-pub(crate) fn drive(draw: &mut Draw, frames: usize, keep_right: bool) -> Vec<Pose> {
-    let mut x = if keep_right { draw.range(0.2, 0.8) } else { draw.range(-0.8, 0.8) };
-    let goal = if keep_right { 0.4 } else { draw.range(-0.3, 0.3) };
+/// lane (its middle at x = `lane`), and a little pitch. With `keep_right` it stays off the oncoming traffic.
+pub(crate) fn drive(draw: &mut Draw, frames: usize, lane: f64, keep_right: bool) -> Vec<Pose> {
+    let mut x = lane + if keep_right { draw.range(0.2, 0.8) } else { draw.range(-0.8, 0.8) };
+    let goal = lane + if keep_right { 0.4 } else { draw.range(-0.3, 0.3) };
     let mut z = 0.0;
     let mut yaw = draw.range(-0.03, 0.03);
     let (mut turn, mut surge) = (0.0, 0.0);
@@ -109,7 +109,7 @@ mod tests {
     #[test]
     fn poses_are_rotations_and_the_car_stays_in_its_lane() {
         for seed in 0..20 {
-            let path = drive(&mut Draw::new(seed, 0, 0), 500, seed % 2 == 0);
+            let path = drive(&mut Draw::new(seed, 0, 0), 500, 0.0, seed % 2 == 0);
             for pair in path.windows(2) {
                 let (a, b) = (pair[0], pair[1]);
                 let step = ((b.position[0] - a.position[0]).powi(2) + (b.position[2] - a.position[2]).powi(2)).sqrt();

@@ -26,19 +26,22 @@ pub(crate) fn row(world: &mut World, draw: &mut Draw, style: &Style, side: f64) 
     let brick = draw.chance(0.4);
     let shops = draw.pick(&[0.0, 0.3, 0.8]);
     let terrace = draw.chance(0.4);
-    let line = draw.range(6.9, 9.5);
+    let (i, back) = ((side > 0.0) as usize, style.half - 5.3);
+    let (open, back) = (style.open[i], back + style.setback[i]);
+    let line = draw.range(6.9, 9.5) + back;
     let closed = draw.pick(&[0.35, 0.67, 0.85]);
     let mut z = style.begin + draw.range(0.0, 4.0);
     while z < style.end {
         let width = draw.range(5.0, 14.0);
-        let front = if terrace { line + draw.range(-0.25, 0.25) } else { draw.range(6.7, 10.5) };
+        let front = if terrace { line + draw.range(-0.25, 0.25) } else { draw.range(6.7, 10.5) + back };
         let height = draw.range(low, high);
         let facade = facade(draw, walls, height, brick, shops);
         house(world, draw, side, front, z, width, facade);
         z += width;
-        if !draw.chance(closed) {
-            let gap = draw.range(1.0, 7.0);
-            fill(world, draw, style, side, front, z, gap);
+        if open || !draw.chance(closed) {
+            let gap = if open { draw.range(6.0, 35.0) } else { draw.range(1.0, 7.0) };
+            let behind = if open { draw.range(14.0, 45.0) } else { 14.0 };
+            fill(world, draw, style, [side, front, behind], z, gap);
             z += gap;
         }
     }
@@ -145,7 +148,8 @@ fn house(world: &mut World, draw: &mut Draw, side: f64, front: f64, z: f64, widt
 }
 
 /// What stands in a gap between houses: a hedge, a wall, trees behind, or nothing.
-fn fill(world: &mut World, draw: &mut Draw, style: &Style, side: f64, front: f64, z: f64, gap: f64) {
+/// `behind` the front stand other houses; all in metres.
+fn fill(world: &mut World, draw: &mut Draw, style: &Style, [side, front, behind]: [f64; 3], z: f64, gap: f64) {
     if draw.chance(0.7) {
         let height = draw.range(0.9, 2.2);
         let (low, high) = beside(side, front + 0.3, front + 1.0);
@@ -162,9 +166,9 @@ fn fill(world: &mut World, draw: &mut Draw, style: &Style, side: f64, front: f64
         props::tree(world, draw, style, x, z + 0.5 * gap, 1.3);
     }
     // The houses of the next street close the view.
-    let (low, high) = beside(side, front + 14.0, front + 22.0);
+    let (low, high) = beside(side, front + behind, front + behind + 8.0);
     let height = draw.range(5.0, 11.0);
     let back = facade(draw, DISTRICTS[3], height, false, 0.0);
     let shape = Shape::Box { low: [low, GROUND_Y - height, z - 8.0], high: [high, GROUND_Y, z + gap + 8.0] };
-    world.add(draw, shape, Material::Facade(back), [side * (front + 14.0), GROUND_Y, z]);
+    world.add(draw, shape, Material::Facade(back), [side * (front + behind), GROUND_Y, z]);
 }

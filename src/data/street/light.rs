@@ -8,8 +8,6 @@ use super::texture::{fade, floor, mix, noise, scale};
 
 /// Where the ground is, in metres below the camera.
 pub(crate) const GROUND: f32 = 1.65;
-/// Where the fronts of the houses stand, nearly: the plane in which their shadows are looked up.
-const FRONTS: f32 = 7.5;
 /// Where the shadow tables begin, in metres along the street.
 pub(crate) const BEHIND: f64 = 20.0;
 
@@ -27,13 +25,16 @@ pub(crate) struct Light {
     cover: f32,
     haze: f32,
     seed: u32,
+    /// Where the fronts of the houses stand, nearly: the planes in which their shadows are looked up, left and right, in
+    /// metres from the middle of the road.
+    fronts: [f32; 2],
     /// Heights of the houses, a value a metre from -[`BEHIND`]: left, right.
     skyline: [Vec<f32>; 2],
 }
 
 impl Light {
     /// A time of day and a weather.
-    pub(crate) fn new(draw: &mut Draw) -> Self {
+    pub(crate) fn new(draw: &mut Draw, fronts: [f64; 2]) -> Self {
         let overcast = draw.chance(0.4);
         let (azimuth, elevation) = (draw.range(-PI, PI), draw.range(0.5, 1.1));
         let flat = libm::cos(elevation);
@@ -58,6 +59,7 @@ impl Light {
             cover: draw.range(-0.12, 0.12) as f32,
             haze: draw.range(0.15, 0.75) as f32,
             seed: draw.bits(),
+            fronts: fronts.map(|x| x as f32),
             skyline: [Vec::new(), Vec::new()],
         }
     }
@@ -75,7 +77,7 @@ impl Light {
 
     /// The share of the sun that reaches a point of the world, between 0 and 1, past the houses.
     fn sunlit(&self, p: [f32; 3]) -> f32 {
-        let side = if self.sun[0] > 0.0 { FRONTS } else { -FRONTS };
+        let side = if self.sun[0] > 0.0 { self.fronts[1] } else { -self.fronts[0] };
         let away = (side - p[0]) * self.sun[0];
         if self.sun[0].abs() < 0.12 || away <= 0.0 {
             return 1.0;

@@ -25,9 +25,10 @@ const PAINTS: [[f64; 3]; 10] = [
 pub(crate) fn parked(world: &mut World, draw: &mut Draw, style: &Style, side: f64, traffic: bool) {
     let mut z = style.begin + draw.range(0.0, 10.0);
     // Oncoming traffic needs the room.
-    let nearest = if traffic && side < 0.0 { 4.0 } else { 3.0 };
+    let nearest = if traffic && side < 0.0 { 4.0 } else { (style.half - 2.3).max(2.75) };
+    let furthest = (style.half - 1.1).max(nearest + 0.2);
     while z < style.end - 10.0 {
-        let x = side * draw.range(nearest, 4.2);
+        let x = side * draw.range(nearest, furthest);
         z += car(world, draw, x, z, side > 0.0, 0.0) + draw.range(1.0, style.car_gap);
     }
 }
@@ -112,7 +113,7 @@ fn car(world: &mut World, draw: &mut Draw, x: f64, z: f64, away: bool, speed: f6
 pub(crate) fn poles(world: &mut World, draw: &mut Draw, style: &Style, side: f64) {
     let mut z = style.begin + draw.range(0.0, 10.0);
     while z < style.end {
-        let x = side * draw.range(style.half + 0.15, 6.2);
+        let x = side * draw.range(style.half + 0.15, style.half + 0.9);
         let origin = [x, GROUND_Y, z];
         match draw.pick(&[0, 0, 1, 1, 2]) {
             0 => {

@@ -25,6 +25,8 @@ pub(crate) type Footprint = [f64; 4];
 
 /// A street.
 pub(crate) struct World {
+    /// The middle of the lane that the camera's car keeps to, in metres from the middle of the road.
+    pub(crate) lane: f64,
     pub(crate) light: Light,
     pub(crate) solids: Vec<Solid>,
     /// The footprints of what is parked, by metres from -[`BEHIND`], left and right: at most two reach into a metre.
@@ -37,6 +39,10 @@ pub(crate) struct World {
 pub(crate) struct Style {
     /// Half the road between the kerbs, in metres.
     pub(crate) half: f64,
+    /// How far the houses stand back behind the pavement, left and right, in metres.
+    pub(crate) setback: [f64; 2],
+    /// Whether a side is built on here and there only.
+    pub(crate) open: [bool; 2],
     /// Where the street begins and ends, in metres.
     pub(crate) begin: f64,
     pub(crate) end: f64,
@@ -56,17 +62,27 @@ impl World {
     /// The street of a sequence of `frames` frames.
     pub(crate) fn new(draw: &mut Draw, frames: usize, moving_cars: bool) -> Self {
         let travel = frames as f64 * FASTEST;
-        let half = draw.range(5.15, 5.45);
+        // Lanes, streets and avenues; traffic needs a street.
+        let half = match draw.pick(&[0, 1, 1, 2, 2]) {
+            0 if !moving_cars => draw.range(4.0, 4.7),
+            2 if !moving_cars => draw.range(6.0, 8.5),
+            _ => draw.range(5.15, 5.45),
+        };
+        let mut garden = || if draw.chance(0.3) { draw.range(2.0, 9.0) } else { 0.0 };
+        let setback = [garden(), garden()];
         let style = Style {
             half,
+            setback,
+            open: [draw.chance(0.25), draw.chance(0.25)],
             begin: -12.0,
             end: travel + FAR as f64,
-            car_gap: draw.pick(&[7.0, 12.0, 14.0, 20.0]),
+            car_gap: draw.pick(&[4.0, 7.0, 12.0, 14.0, 20.0, 45.0]),
             tree_gap: draw.pick(&[0.0, 9.0, 16.0, 30.0]),
             foliage: vary(draw, GREEN, 0.04, 0.06),
         };
-        let light = Light::new(draw);
-        let mut world = World { light, solids: Vec::new(), shade: [Vec::new(), Vec::new()], movers: Vec::new() };
+        let light = Light::new(draw, setback.map(|back| half + 2.2 + back));
+        let lane = draw.range(-0.6, 0.6) * (half - 5.5).max(0.0);
+        let mut world = World { lane, light, solids: Vec::new(), shade: [Vec::new(), Vec::new()], movers: Vec::new() };
         world.ground(draw, &style);
         for side in [-1.0, 1.0] {
             houses::row(&mut world, draw, &style, side);

@@ -1,17 +1,26 @@
 //! The planted bugs, by class. Where one was found in the wild, its line says where; the catalogue has the links.
 
+use parallax::ops::activation::LeakyRelu;
 use parallax::ops::batch_norm::BatchNorm;
 use parallax::ops::concat::Concat;
+use parallax::ops::conv_transpose2d::ConvTranspose2d;
+use parallax::ops::cumulative::CumSum;
+use parallax::ops::dropout::Dropout;
 use parallax::ops::grid_sample::{GridPadding, GridSample};
+use parallax::ops::index_select::IndexSelect;
 use parallax::ops::layer_norm::LayerNorm;
+use parallax::ops::norm::L2Normalize;
 use parallax::ops::pool2d::{AvgPool2d, MaxPool2d};
 use parallax::ops::reduce::{Extreme, Max, Sum};
 use parallax::ops::reflect_pad::ReflectPad;
+use parallax::ops::repeat::Repeat;
 use parallax::ops::shape_ops::Permute;
 use parallax::ops::slice::Slice;
 use parallax::ops::softmax::Softmax;
+use parallax::ops::unary::Unary;
+use parallax::ops::variance::Variance;
 use parallax::ops::{Conv2d, apply};
-use parallax::tensor::{Shape, Tensor, parallel};
+use parallax::tensor::{Shape, Tensor, Var, parallel};
 
 use super::HandOver::{OntoStale, Overwriting, Right};
 use super::{Backward, Gradients, HandOver, Mutant};
@@ -73,6 +82,15 @@ pub static ALL: &[Mutant] = &[
             d.data_mut().chunks_exact_mut(2).for_each(|xy| (xy[0], xy[1]) = (xy[0] * factor, xy[1] / factor));
         })
     }),
+    bug("arguments", "conv_transpose2d", "stride and dilation swapped", |b| {
+        let op = *b.op::<ConvTranspose2d>();
+        b.of(b.inputs, &b.upstream, |v| apply(ConvTranspose2d { stride: op.dilation, dilation: op.stride, ..op }, v))
+    }),
+    bug("arguments", "variance", "the correction ignored", |b| {
+        let Variance { first, count, correction, .. } = *b.op::<Variance>();
+        let n = b.x(0).dims()[first..first + count].iter().product::<usize>() as f64;
+        scaled(b, 0, (n - correction as f64) / n)
+    }),
     // Axis: the last one always (burn 3555), the first dimension for all (FlagGems 5392).
     bug("axis", "max", "scattered along the last axis", |b| {
         let Extreme { count, .. } = *b.op::<Extreme<Max>>();
@@ -114,6 +132,25 @@ pub static ALL: &[Mutant] = &[
         let last = b.x(0).shape().rank() - 1;
         if axis == last { b.right() } else { b.of(b.inputs, &b.upstream, |v| apply(Softmax { axis: last }, v)) }
     }),
+    bug("axis", "sort", "the order not undone", |b| b.changed(0, |d| *d = b.g().clone())),
+    bug("axis", "flip", "not turned back", |b| b.changed(0, |d| *d = b.g().clone())),
+    bug("axis", "repeat", "summed over the whole dimension", |b| {
+        let Repeat { axis, .. } = *b.op::<Repeat>();
+        b.changed(0, |d| {
+            let inner: usize = d.dims()[axis + 1..].iter().product();
+            let run = d.dims()[axis] * inner;
+            for d in d.data_mut().chunks_exact_mut(run.max(1)) {
+                for i in 0..inner {
+                    let sum: f64 = d.iter().skip(i).step_by(inner).sum();
+                    d.iter_mut().skip(i).step_by(inner).for_each(|d| *d = sum);
+                }
+            }
+        })
+    }),
+    bug("axis", "cumsum", "summed forwards", |b| {
+        let CumSum { axis } = *b.op::<CumSum>();
+        b.changed(0, |d| *d = Var::constant(b.g().clone()).cumsum(axis).into_value())
+    }),
     // Borders and remainders.
     bug("border", "conv2d", "the tail of a strided image dropped", |b| {
         let [_, h, w, c] = b.x(0).shape().nhwc().expect("an image");
@@ -133,7 +170,7 @@ pub static ALL: &[Mutant] = &[
         let ReflectPad { left, top, .. } = *b.op::<ReflectPad>();
         let [_, h, w, _] = b.x(0).shape().nhwc().expect("an image");
         b.changed(0, |d| {
-            let g = parallax::tensor::Var::constant(b.g().clone());
+            let g = Var::constant(b.g().clone());
             *d = g.slice(1, top..top + h).slice(2, left..left + w).into_value();
         })
     }),
@@ -175,6 +212,17 @@ pub static ALL: &[Mutant] = &[
             }
         })
     }),
+    bug("border", "conv_transpose2d", "the last row dropped", |b| {
+        let [_, h, w, c] = b.x(0).shape().nhwc().expect("an image");
+        b.changed(0, |d| {
+            let images = d.data_mut().chunks_exact_mut((h * w * c).max(1));
+            images.for_each(|image| image[(h - 1) * w * c..].fill(0.0));
+        })
+    }),
+    bug("border", "scatter_add", "values that the index does not reach", |b| {
+        let first = b.g().data().first().copied().unwrap_or(0.0);
+        b.changed(2, |d| d.data_mut().iter_mut().filter(|d| **d == 0.0).for_each(|d| *d = first))
+    }),
     // The upstream gradient ignored, in whole or in part.
     bug("cotangent", "linear", "the bias counts rows", |b| {
         let rows = b.x(0).shape().rows() as f64;
@@ -194,12 +242,29 @@ pub static ALL: &[Mutant] = &[
         b.by_element(|g, x| g * (f64::from(x > 0.0) + f64::from(x <= 0.0) * x.exp()))
     }),
     bug("extreme", "gelu", "the tail cut off", |b| b.by_element_where(|x| x > 15.0, 0.0)),
+    bug("extreme", "select", "zero times what was not chosen", |b| {
+        b.changed(1, |d| d.data_mut().iter_mut().zip(b.x(1).data()).for_each(|(d, x)| *d += 0.0 * x))
+    }),
+    bug("extreme", "softplus", "a quotient of infinities", |b| b.by_element(|g, x| g * x.exp() / (1.0 + x.exp()))),
     // Values used more than once.
     handed(Overwriting, "fan-out", "upsample_nearest", "overwrites what another use gave", |b| b.right()),
     handed(Overwriting, "fan-out", "mul", "overwrites what another use gave", |b| b.right()),
     handed(Overwriting, "fan-out", "batch_norm", "overwrites what another use gave", |b| b.right()),
     handed(OntoStale, "fan-out", "max_pool2d", "onto memory that was not cleared", |b| b.right()),
     handed(OntoStale, "fan-out", "concat", "onto memory that was not cleared", |b| b.right()),
+    bug("fan-out", "index_select", "of equal indices the last one wins", |b| {
+        let IndexSelect { axis } = *b.op::<IndexSelect>();
+        let index: Vec<usize> = b.x(1).data().iter().map(|i| *i as usize).collect();
+        b.changed(0, |d| {
+            let (n, inner): (usize, usize) = (d.dims()[axis], d.dims()[axis + 1..].iter().product());
+            for (outer, g) in b.g().data().chunks((index.len() * inner).max(1)).enumerate() {
+                for (&i, g) in index.iter().zip(g.chunks(inner)) {
+                    d.data_mut()[(outer * n + i) * inner..][..inner].copy_from_slice(g);
+                }
+            }
+        })
+    }),
+    handed(Overwriting, "fan-out", "gather", "overwrites what another use gave", |b| b.right()),
     // Groups.
     bug("groups", "conv2d", "the group of an output is its number modulo groups", |b| {
         let groups = b.op::<Conv2d>().groups;
@@ -269,6 +334,12 @@ pub static ALL: &[Mutant] = &[
         all.iter_mut().flatten().for_each(|d| d.data_mut().fill(share));
         all
     }),
+    bug("kink", "relu6", "a half at 6", |b| b.by_element_where(|x| x == 6.0, 0.5)),
+    bug("kink", "hardsigmoid", "a slope where it is flat", |b| b.by_element_where(|x| x < -3.0, 1.0 / 6.0)),
+    bug("kink", "leaky_relu", "the slope squared", |b| {
+        let LeakyRelu { slope } = b.op::<Unary<LeakyRelu>>().0;
+        b.by_element(|g, x| if x > 0.0 { g } else { g * slope * slope })
+    }),
     // Layout.
     bug("layout", "conv2d", "the window not turned", |b| {
         let mut inputs = b.inputs.to_vec();
@@ -314,11 +385,23 @@ pub static ALL: &[Mutant] = &[
         }
         both
     }),
+    bug("scale", "dropout", "not divided by what is kept", |b| scaled(b, 0, b.op::<Dropout>().keep)),
+    bug("scale", "cross_entropy", "ignored rows counted", |b| {
+        let counted = b.x(1).data().iter().filter(|t| **t >= 0.0).count();
+        scaled(b, 0, counted as f64 / b.x(1).len().max(1) as f64)
+    }),
+    bug("scale", "log_sum_exp", "equal shares", |b| {
+        b.changed(0, |d| {
+            let mean = d.data().iter().sum::<f64>() / d.len().max(1) as f64;
+            d.data_mut().fill(mean);
+        })
+    }),
     // Sign.
     bug("sign", "div", "the denominator's", |b| scaled(b, 1, -1.0)),
     bug("sign", "minimum", "the second operand's", |b| scaled(b, 1, -1.0)),
     bug("sign", "warp", "the pose's", |b| scaled(b, 2, -1.0)),
     bug("sign", "sqrt", "divided by the argument, not by the result", |b| b.by_element(|g, x| 0.5 * g / x)),
+    bug("sign", "cross", "the second operand's", |b| scaled(b, 1, -1.0)),
     // Which inputs are tracked.
     bug("subset", "concat", "misaligned where a part is constant", |b| {
         let mut parts = b.right();
@@ -329,6 +412,9 @@ pub static ALL: &[Mutant] = &[
         parts
     }),
     bug("subset", "mul", "nothing saved where one side is constant", |b| {
+        scaled(b, 0, if b.wanted[1] { 1.0 } else { 0.0 })
+    }),
+    bug("subset", "pow", "nothing saved where one side is constant", |b| {
         scaled(b, 0, if b.wanted[1] { 1.0 } else { 0.0 })
     }),
     // A term dropped, or one too many.
@@ -370,6 +456,18 @@ pub static ALL: &[Mutant] = &[
     }),
     bug("term", "tanh", "of the argument, not of the result", |b| b.by_element(|g, x| g * (1.0 - x * x))),
     bug("term", "batch_norm", "the statistics taken for constants", statistics_constant),
+    bug("term", "log_softmax", "the sum forgotten", |b| b.changed(0, |d| *d = b.g().clone())),
+    bug("term", "l2_normalize", "another eps backwards", |b| {
+        let L2Normalize { eps } = *b.op::<L2Normalize>();
+        b.of(b.inputs, &b.upstream, |v| apply(L2Normalize { eps: 2.0 * eps }, v))
+    }),
+    bug("term", "top_k", "the first ones, not the largest", |b| {
+        b.changed(0, |d| {
+            let n = b.g().len();
+            d.data_mut().fill(0.0);
+            d.data_mut()[..n].copy_from_slice(b.g().data());
+        })
+    }),
     // Exact zeros.
     bug("zero", "abs", "x over its absolute value", |b| b.by_element(|g, x| g * x / x.abs())),
     bug("zero", "axis_angle_to_rotation", "divided by an angle of 0", |b| {
@@ -384,7 +482,35 @@ pub static ALL: &[Mutant] = &[
         let differences: Vec<f64> = b.x(0).data().iter().zip(b.x(1).data()).map(|(a, b)| a - b).collect();
         b.changed(0, |d| d.data_mut().iter_mut().zip(&differences).for_each(|(d, x)| *d = *d * x / x))
     }),
+    bug("zero", "silu", "the result over the argument", |b| {
+        b.by_element(|g, x| {
+            let y = x / (1.0 + (-x).exp());
+            g * y / x * (1.0 + x - y)
+        })
+    }),
+    bug("zero", "log_sigmoid", "nothing at 0", |b| b.by_element_where(|x| x == 0.0, 0.0)),
+    bug("zero", "pow", "the logarithm of 0", |b| {
+        if b.x(0).shape() != b.x(1).shape() {
+            return b.right();
+        }
+        b.changed(1, |d| d.data_mut().iter_mut().zip(b.x(0).data()).for_each(|(d, a)| *d = *d * a / a))
+    }),
+    bug("zero", "prod", "divided by the factor", by_the_argument_over_itself),
+    bug("zero", "cumprod", "divided by the factor", by_the_argument_over_itself),
+    bug("zero", "norm", "divided by a length of 0", by_the_argument_over_itself),
+    bug("zero", "variance", "a root of nothing", |b| {
+        b.changed(0, |d| {
+            if d.data().iter().all(|d| *d == 0.0) {
+                d.data_mut().fill(f64::NAN);
+            }
+        })
+    }),
 ];
+
+/// Right but for zeros, where the quotient is NaN.
+fn by_the_argument_over_itself(b: &Backward) -> Gradients {
+    b.changed(0, |d| d.data_mut().iter_mut().zip(b.x(0).data()).for_each(|(d, x)| *d = *d * x / x))
+}
 
 /// The right gradients, with that of one input multiplied.
 fn scaled(b: &Backward, input: usize, factor: f64) -> Gradients {
