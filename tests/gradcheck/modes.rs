@@ -1,5 +1,5 @@
 //! The same cases in other circumstances, compared bit by bit with the first result: a poisoned pool, one and two
-//! threads, subsets of tracked inputs; and f32 against f64.
+//! threads, subsets of tracked inputs; one input used several times; and f32 against f64.
 
 use parallax::gradcheck::{cotangents, draw};
 use parallax::ops::registry::{self, AnyCase};
@@ -100,6 +100,29 @@ fn one_value_in_several_places_gets_the_sum_of_their_gradients() {
         }
     });
     assert!(tried >= 6, "only {tried} cases have inputs of one shape");
+}
+
+/// The op applied twice to the same inputs: every kernel adds to a gradient that is already there.
+#[test]
+fn two_uses_of_the_same_inputs_have_twice_the_gradient() {
+    for_each_case(|case, inputs, what| {
+        let all = differentiable(case);
+        let once = run(case, inputs, &all).1;
+        let tape = Tape::new();
+        let leaf = |(x, &on): (&Tensor<f64>, &bool)| if on { tape.leaf(x.clone()) } else { x.clone().into() };
+        let vars: Vec<Var<f64>> = inputs.iter().zip(&all).map(leaf).collect();
+        let [first, second] = [0, 1].map(|_| case.run(&vars.iter().collect::<Vec<_>>()));
+        let outputs = || first.iter().zip(cotangents(&first, 1)).chain(second.iter().zip(cotangents(&second, 1)));
+        let seeds: Vec<_> = outputs().filter_map(|(y, c)| Some((y, c?))).collect();
+        let twice = tape.backward(&seeds);
+        for (i, (once, v)) in once.iter().zip(&vars).enumerate() {
+            let (Some(once), Some(twice)) = (once, twice.get(v)) else { continue };
+            for (k, (&one, &two)) in once.data().iter().zip(twice.data()).enumerate() {
+                let close = (two - 2.0 * one).abs() <= 1e-12 * one.abs().max(1.0);
+                assert!(close, "{what}: input {i}, element {k}: {two} for two uses, {one} for one");
+            }
+        }
+    });
 }
 
 /// The f32 kernels, forward and backward, against f64 on the same (rounded) numbers.
