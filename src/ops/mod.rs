@@ -9,6 +9,7 @@ mod op;
 pub mod registry;
 pub mod trace;
 
+pub mod activation;
 pub mod batch_norm;
 pub mod binary;
 pub mod concat;
@@ -26,6 +27,7 @@ mod per_head;
 pub mod photometric;
 pub mod pool2d;
 pub mod pose;
+pub mod pow;
 pub mod reduce;
 pub mod reflect_pad;
 pub mod resize_bilinear;

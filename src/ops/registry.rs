@@ -71,6 +71,14 @@ registry! {
     "pose_matrix" => pose::PoseMatrix,
     "conv_relative_position" => conv_relative_position::ConvRelativePosition,
     "disparity_to_depth" => unary::Unary<disparity_to_depth::DisparityToDepth>,
+    "softplus" => unary::Unary<activation::Softplus>,
+    "log_sigmoid" => unary::Unary<activation::LogSigmoid>,
+    "silu" => unary::Unary<activation::Silu>,
+    "leaky_relu" => unary::Unary<activation::LeakyRelu>,
+    "relu6" => unary::Unary<activation::Relu6>,
+    "hardsigmoid" => unary::Unary<activation::Hardsigmoid>,
+    "pow" => binary::Binary<pow::Pow>,
+    "powf" => unary::Unary<pow::Powf>,
 }
 
 /// One op as the suite sees it.
