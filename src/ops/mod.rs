@@ -32,6 +32,7 @@ pub mod reduce;
 pub mod reflect_pad;
 pub mod resize_bilinear;
 pub mod rotation;
+pub mod select;
 pub mod shape_ops;
 pub mod slice;
 pub mod smoothness;

@@ -79,6 +79,7 @@ registry! {
     "hardsigmoid" => unary::Unary<activation::Hardsigmoid>,
     "pow" => binary::Binary<pow::Pow>,
     "powf" => unary::Unary<pow::Powf>,
+    "select" => select::Select,
 }
 
 /// One op as the suite sees it.
