@@ -80,6 +80,12 @@ registry! {
     "pow" => binary::Binary<pow::Pow>,
     "powf" => unary::Unary<pow::Powf>,
     "select" => select::Select,
+    "prod" => prod::Prod,
+    "cumsum" => cumulative::CumSum,
+    "cumprod" => cumulative::CumProd,
+    "norm" => norm::Norm,
+    "l2_normalize" => norm::L2Normalize,
+    "variance" => variance::Variance,
 }
 
 /// One op as the suite sees it.
