@@ -86,6 +86,9 @@ registry! {
     "norm" => norm::Norm,
     "l2_normalize" => norm::L2Normalize,
     "variance" => variance::Variance,
+    "log_sum_exp" => log_sum_exp::LogSumExp,
+    "log_softmax" => log_softmax::LogSoftmax,
+    "cross_entropy" => cross_entropy::CrossEntropy,
 }
 
 /// One op as the suite sees it.
