@@ -26,7 +26,7 @@ const LANES: usize = 16;
 
 /// The sum of `f` over two rows, in [`LANES`] partial sums.
 #[inline(always)]
-fn sum<T: Float>(a: &[T], b: &[T], f: impl Fn(T, T) -> T) -> T {
+pub(super) fn sum<T: Float>(a: &[T], b: &[T], f: impl Fn(T, T) -> T) -> T {
     let mut sums = [T::ZERO; LANES];
     let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
     for (a, b) in a.iter().zip(b) {

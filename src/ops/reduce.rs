@@ -16,12 +16,13 @@ pub struct Sum {
 }
 
 /// A shape cut in three: what stands before the reduced dimensions, they themselves, and what comes after.
-fn cut(shape: &Shape, first: usize, count: usize) -> [usize; 3] {
+pub(super) fn cut(shape: &Shape, first: usize, count: usize) -> [usize; 3] {
     let d = shape.dims();
     [d[..first].iter().product(), d[first..first + count].iter().product(), d[first + count..].iter().product()]
 }
 
-fn dropped(shape: &Shape, first: usize, count: usize) -> Result<Vec<Shape>, ShapeError> {
+/// The shape without the run of dimensions.
+pub(super) fn dropped(shape: &Shape, first: usize, count: usize) -> Result<Vec<Shape>, ShapeError> {
     if first + count > shape.rank() {
         return Err(ShapeError::new(format!("no dimensions {first}..{}", first + count)));
     }
@@ -56,12 +57,8 @@ impl<T: Float> Op<T> for Sum {
                 return out.fill(T::ZERO * factor);
             }
             for (out, x) in out.chunks_mut(inner.max(1)).zip(x.data().chunks(n * inner.max(1))) {
-                if inner == 1 {
-                    out[0] = pairwise_sum(x) * factor;
-                } else {
-                    sum_rows(out, x);
-                    out.iter_mut().for_each(|y| *y *= factor);
-                }
+                sum_rows(out, x);
+                out.iter_mut().for_each(|y| *y *= factor);
             }
         });
         (vec![y], *x.shape())
@@ -108,8 +105,12 @@ pub(crate) fn pairwise_sum<T: Float>(x: &[T]) -> T {
 }
 
 /// The sum of the rows of a matrix, in blocks that are then summed in pairs.
-fn sum_rows<T: Float>(out: &mut [T], x: &[T]) {
+pub(super) fn sum_rows<T: Float>(out: &mut [T], x: &[T]) {
     const BLOCK: usize = 64;
+    if let [sum] = out {
+        *sum = pairwise_sum(x);
+        return;
+    }
     let (cols, rows) = (out.len(), x.len() / out.len());
     out.fill(T::ZERO);
     if rows <= BLOCK {

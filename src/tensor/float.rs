@@ -61,6 +61,10 @@ pub trait Float:
     fn exp(self) -> Self;
     /// The natural logarithm.
     fn ln(self) -> Self;
+    /// ln(1 + self), exact where `self` is small.
+    fn ln_1p(self) -> Self;
+    /// `self` to a power. As IEEE 754 has it, anything (NaN too) to the power 0 is 1, and 1 to any power is 1.
+    fn powf(self, exponent: Self) -> Self;
     /// The square root.
     fn sqrt(self) -> Self;
     /// The sine.
@@ -156,6 +160,14 @@ impl Float for f32 {
         f32::ln(self)
     }
     #[inline(always)]
+    fn ln_1p(self) -> f32 {
+        f32::ln_1p(self)
+    }
+    #[inline(always)]
+    fn powf(self, exponent: f32) -> f32 {
+        f32::powf(self, exponent)
+    }
+    #[inline(always)]
     fn sqrt(self) -> f32 {
         f32::sqrt(self)
     }
@@ -242,6 +254,14 @@ impl Float for f64 {
     #[inline(always)]
     fn ln(self) -> f64 {
         f64::ln(self)
+    }
+    #[inline(always)]
+    fn ln_1p(self) -> f64 {
+        f64::ln_1p(self)
+    }
+    #[inline(always)]
+    fn powf(self, exponent: f64) -> f64 {
+        f64::powf(self, exponent)
     }
     #[inline(always)]
     fn sqrt(self) -> f64 {
