@@ -16,7 +16,7 @@ pub struct Sum {
 }
 
 /// A shape cut in three: what stands before the reduced dimensions, they themselves, and what comes after.
-fn cut(shape: &Shape, first: usize, count: usize) -> [usize; 3] {
+pub(super) fn cut(shape: &Shape, first: usize, count: usize) -> [usize; 3] {
     let d = shape.dims();
     [d[..first].iter().product(), d[first..first + count].iter().product(), d[first + count..].iter().product()]
 }

@@ -70,6 +70,11 @@ registry! {
     "min_reprojection" => min_reprojection::MinReprojection,
     "pose_matrix" => pose::PoseMatrix,
     "conv_relative_position" => conv_relative_position::ConvRelativePosition,
+    "index_select" => index_select::IndexSelect,
+    "gather" => gather::Gather,
+    "scatter_add" => scatter_add::ScatterAdd,
+    "sort" => sort::Sort,
+    "top_k" => top_k::TopK,
     "disparity_to_depth" => unary::Unary<disparity_to_depth::DisparityToDepth>,
 }
 
