@@ -75,6 +75,10 @@ registry! {
     "scatter_add" => scatter_add::ScatterAdd,
     "sort" => sort::Sort,
     "top_k" => top_k::TopK,
+    "dropout" => dropout::Dropout,
+    "cross" => cross::Cross,
+    "repeat" => repeat::Repeat,
+    "flip" => flip::Flip,
     "disparity_to_depth" => unary::Unary<disparity_to_depth::DisparityToDepth>,
 }
 
