@@ -14,6 +14,7 @@ pub mod binary;
 pub mod concat;
 pub mod conv2d;
 pub mod conv_relative_position;
+pub mod conv_transpose2d;
 pub mod cross;
 pub mod depthwise_conv2d;
 pub mod disparity_to_depth;
@@ -51,5 +52,6 @@ pub mod warp;
 
 pub use apply::{apply, apply1};
 pub use case::{Case, Input};
+pub use conv_transpose2d::ConvTranspose2d;
 pub use conv2d::Conv2d;
 pub use op::{Checked, CustomOp, Needs, Op, Registered, ShapeError};

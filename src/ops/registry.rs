@@ -76,6 +76,7 @@ registry! {
     "sort" => sort::Sort,
     "top_k" => top_k::TopK,
     "dropout" => dropout::Dropout,
+    "conv_transpose2d" => conv_transpose2d::ConvTranspose2d,
     "cross" => cross::Cross,
     "repeat" => repeat::Repeat,
     "flip" => flip::Flip,
