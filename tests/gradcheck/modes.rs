@@ -102,6 +102,30 @@ fn one_value_in_several_places_gets_the_sum_of_their_gradients() {
     assert!(tried >= 6, "only {tried} cases have inputs of one shape");
 }
 
+/// An input that two ops use gets the sum of both gradients: the second finds that of the first in place, and adds.
+#[test]
+fn a_value_used_twice_gets_both_gradients() {
+    for_each_case(|case, inputs, what| {
+        let all = differentiable(case);
+        let once = run(case, inputs, &all).1;
+        let tape = Tape::new();
+        let leaf = |(x, &on): (&Tensor<f64>, &bool)| if on { tape.leaf(x.clone()) } else { x.clone().into() };
+        let vars: Vec<Var<f64>> = inputs.iter().zip(&all).map(leaf).collect();
+        let uses = [(); 2].map(|_| case.run(&vars.iter().collect::<Vec<_>>()));
+        let seeds: Vec<_> = uses.iter().flat_map(|y| y.iter().zip(cotangents(y, 1))).collect();
+        let seeds: Vec<_> = seeds.into_iter().filter_map(|(y, c)| Some((y, c?))).collect();
+        let twice = tape.backward(&seeds);
+        for (i, (v, once)) in vars.iter().zip(&once).enumerate() {
+            let (Some(twice), Some(once)) = (twice.get(v), once) else { continue };
+            let scale = once.data().iter().fold(0.0f64, |m, g| m.max(g.abs()));
+            for (k, (&g, &h)) in twice.data().iter().zip(once.data()).enumerate() {
+                let close = (g - 2.0 * h).abs() <= 1e-12 * scale;
+                assert!(close, "{what}: the gradient of input {i}, element {k}: {g} for twice {h}");
+            }
+        }
+    });
+}
+
 /// The f32 kernels, forward and backward, against f64 on the same (rounded) numbers.
 #[test]
 fn f32_follows_f64() {
