@@ -101,7 +101,7 @@ impl Checked for Sort {
         let x = |shape: &[usize]| Input::distinct("x", shape);
         let tie = |numbers: &[f64]| Input::values("x", [numbers.len()], numbers);
         vec![
-            Case::new("first axis", up(0), [x(&[5, 2, 2])]),
+            Case::new("first axis", up(0), [x(&[3, 2, 4])]),
             Case::new("middle axis", up(1), [x(&[2, 5, 3])]),
             Case::new("last axis", up(2), [x(&[2, 3, 5])]),
             Case::new("rows of images", up(1), [x(&[2, 4, 3, 2])]),

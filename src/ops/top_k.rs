@@ -59,7 +59,7 @@ impl Checked for TopK {
         let x = |shape: &[usize]| Input::distinct("x", shape);
         let tie = |numbers: &[f64]| Input::values("x", [numbers.len()], numbers);
         vec![
-            Case::new("first axis", large(0, 2), [x(&[5, 2, 2])]),
+            Case::new("first axis", large(0, 2), [x(&[3, 2, 4])]),
             Case::new("middle axis", large(1, 3), [x(&[2, 5, 3])]),
             Case::new("last axis", large(2, 2), [x(&[2, 3, 5])]),
             Case::new("channels of images", large(3, 1), [x(&[2, 2, 3, 4])]),
