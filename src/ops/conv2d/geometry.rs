@@ -7,18 +7,18 @@ use crate::tensor::Shape;
 /// Everything about a convolution but its numbers. Pairs are (height, width).
 #[derive(Clone, Copy, Debug)]
 pub struct Geometry {
-    pub(super) batch: usize,
-    pub(super) size: [usize; 2],
-    pub(super) channels: usize,
-    pub(super) out: [usize; 2],
-    pub(super) out_channels: usize,
-    pub(super) kernel: [usize; 2],
-    pub(super) stride: [usize; 2],
-    pub(super) padding: [usize; 2],
-    pub(super) dilation: [usize; 2],
-    pub(super) groups: usize,
-    pub(super) reflect: bool,
-    pub(super) tile: usize,
+    pub(in crate::ops) batch: usize,
+    pub(in crate::ops) size: [usize; 2],
+    pub(in crate::ops) channels: usize,
+    pub(in crate::ops) out: [usize; 2],
+    pub(in crate::ops) out_channels: usize,
+    pub(in crate::ops) kernel: [usize; 2],
+    pub(in crate::ops) stride: [usize; 2],
+    pub(in crate::ops) padding: [usize; 2],
+    pub(in crate::ops) dilation: [usize; 2],
+    pub(in crate::ops) groups: usize,
+    pub(in crate::ops) reflect: bool,
+    pub(in crate::ops) tile: usize,
 }
 
 impl Geometry {
@@ -115,7 +115,7 @@ impl Geometry {
     }
 
     /// The convolution of dy that gives dx, if it is one: stride 1, and a window that reaches beyond the padding.
-    pub(super) fn transposed(&self) -> Option<Geometry> {
+    pub(in crate::ops) fn transposed(&self) -> Option<Geometry> {
         let mut padding = [0; 2];
         for (d, p) in padding.iter_mut().enumerate() {
             *p = (self.dilation[d] * (self.kernel[d] - 1)).checked_sub(self.padding[d])?;

@@ -58,7 +58,14 @@ fn im2col_tile<T: Float>(g: &Geometry, x: &[T], first: usize, rows: usize, group
 }
 
 /// `out = conv(x, w) + bias`, or added to what is there.
-pub(super) fn convolve<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: &[T], w: &[T], bias: Option<&[T]>) {
+pub(in crate::ops) fn convolve<T: Float>(
+    out: &mut [T],
+    accum: Accum,
+    g: &Geometry,
+    x: &[T],
+    w: &[T],
+    bias: Option<&[T]>,
+) {
     let (n, patch, width, tile) = (g.out_channels, g.patch(), g.out[1], g.tile());
     let work = 2 * g.rows() * width * patch * n;
     parallel::for_each_chunk(out, tile * width * n, work, |i, out| {
@@ -106,7 +113,7 @@ fn turned<T: Float>(g: &Geometry, w: &[T]) -> Buffer<T> {
 }
 
 /// dx from dy.
-pub(super) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, dy: &[T], w: &[T]) {
+pub(in crate::ops) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, dy: &[T], w: &[T]) {
     match g.transposed() {
         Some(t) => {
             let turned = turned(g, w);
@@ -214,7 +221,7 @@ fn scatter<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, dy: &[T], w: &[T
 }
 
 /// dw: the sum over pixels of patch^T dy, in a fixed number of partial sums.
-pub(super) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: &[T], dy: &[T]) {
+pub(in crate::ops) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: &[T], dy: &[T]) {
     let (n, ng, patch, width, tile) = (g.out_channels, g.group_out(), g.patch(), g.out[1], g.tile());
     let tiles = g.rows().div_ceil(tile);
     let parts = tiles.clamp(1, PARTS);

@@ -4,8 +4,8 @@
 //! so a tile of the im2col matrix is filled by copies of whole runs. Reflection padding is a matter of which run is
 //! copied, and costs nothing.
 
-mod geometry;
-mod kernel;
+pub(super) mod geometry;
+pub(super) mod kernel;
 
 use super::linear;
 use super::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
