@@ -105,7 +105,9 @@ impl Function for LeakyRelu {
         let op = |slope| Unary(LeakyRelu { slope });
         vec![
             Case::new("both sides", op(0.2), [Input::away("x", [3, 4, 5], -2.0, 2.0, &[0.0])]),
-            Case::new("exactly 0", op(0.2), [Input::values("x", [4], [0.0, -0.0, -1.0, 1.0])]).kinks(2),
+            Case::new("exactly 0", op(0.2), [Input::values("x", [4], [0.0, -0.0, -1.0, 1.0])])
+                .kinks(2)
+                .promises(0, [0.2, 0.2, 0.2, 1.0]),
             Case::new("a negative slope", op(-0.5), [Input::away("x", [7], -2.0, 2.0, &[0.0])]),
             Case::new("empty", op(0.2), [Input::random("x", [0])]).flat(),
         ]
@@ -128,7 +130,9 @@ impl Function for Relu6 {
     fn cases() -> Vec<Case<Unary<Self>>> {
         vec![
             Case::new("three pieces", Unary(Relu6), [Input::away("x", [3, 4, 5], -3.0, 9.0, &[0.0, 6.0])]),
-            Case::new("at the joints", Unary(Relu6), [Input::values("x", [3], [0.0, 6.0, 3.0])]).kinks(2),
+            Case::new("at the joints", Unary(Relu6), [Input::values("x", [3], [0.0, 6.0, 3.0])])
+                .kinks(2)
+                .promises(0, [0.0, 0.0, 1.0]),
             Case::new("all outside", Unary(Relu6), [Input::values("x", [3], [-800.0, 7.0, 800.0])]).flat(),
         ]
     }
@@ -150,7 +154,9 @@ impl Function for Hardsigmoid {
     fn cases() -> Vec<Case<Unary<Self>>> {
         vec![
             Case::new("three pieces", Unary(Hardsigmoid), [Input::away("x", [4, 4, 5], -5.0, 5.0, &[-3.0, 3.0])]),
-            Case::new("at the joints", Unary(Hardsigmoid), [Input::values("x", [3], [-3.0, 3.0, 0.0])]).kinks(2),
+            Case::new("at the joints", Unary(Hardsigmoid), [Input::values("x", [3], [-3.0, 3.0, 0.0])])
+                .kinks(2)
+                .promises(0, [0.0, 0.0, 1.0 / 6.0]),
             Case::new("all outside", Unary(Hardsigmoid), [Input::values("x", [3], [-800.0, 4.0, 800.0])]).flat(),
         ]
     }

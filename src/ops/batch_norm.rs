@@ -572,36 +572,4 @@ mod tests {
             assert!((var[k] / v - 1.0).abs() < 1e-5, "{} for {v}", var[k]);
         }
     }
-
-    #[test]
-    #[ignore = "a measurement"]
-    fn time() {
-        for (n, c) in [(4 * 48 * 160, 32), (4 * 24 * 80, 48), (4 * 12 * 40, 64), (4 * 6 * 20, 96)] {
-            let mut random = Random::new(1, 2);
-            let tensor = |random: &mut Random, shape: &[usize]| -> Tensor<f32> {
-                Tensor::build(shape, |o| o.iter_mut().for_each(|x| *x = random.uniform(-1.0, 1.0) as f32))
-            };
-            let (x, w, b, g) = (
-                tensor(&mut random, &[n, c]),
-                tensor(&mut random, &[c]),
-                tensor(&mut random, &[c]),
-                tensor(&mut random, &[n, c]),
-            );
-            let (mut forward, mut back) = (Vec::new(), Vec::new());
-            for _ in 0..41 {
-                let tape = crate::tensor::Tape::new();
-                let (x, w, b) = (tape.leaf(x.clone()), tape.leaf(w.clone()), tape.leaf(b.clone()));
-                let start = std::time::Instant::now();
-                let (y, _, _) = x.batch_norm(&w, &b, 1e-5, Activation::Hardswish);
-                forward.push(start.elapsed());
-                let start = std::time::Instant::now();
-                let gradients = tape.backward(&[(&y, g.clone())]);
-                back.push(start.elapsed());
-                drop(gradients);
-            }
-            forward.sort();
-            back.sort();
-            println!("{n}x{c}: forward {:?}, backward {:?}", forward[20], back[20]);
-        }
-    }
 }

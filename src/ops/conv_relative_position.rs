@@ -508,34 +508,4 @@ mod tests {
             first += h * c;
         }
     }
-
-    #[test]
-    #[ignore = "a measurement"]
-    fn time() {
-        for (height, width, channels) in [(24, 80, 48), (12, 40, 64), (6, 20, 96), (3, 10, 96)] {
-            let mut random = Random::new(1, 2);
-            let qkv: Tensor<f32> = tensor(&mut random, &[4, height * width, 3 * channels]);
-            let g: Tensor<f32> = tensor(&mut random, &[4, height * width, channels]);
-            let c = channels / 8;
-            let parameters = [(3, 2), (5, 3), (7, 3)]
-                .map(|(k, h)| (k, h, tensor::<f32>(&mut random, &[k, k, h * c]), tensor::<f32>(&mut random, &[h * c])));
-            let (mut forward, mut back) = (Vec::new(), Vec::new());
-            for _ in 0..41 {
-                let tape = crate::tensor::Tape::new();
-                let qkv = tape.leaf(qkv.clone());
-                let leaves = parameters.clone().map(|(k, h, w, b)| (k, h, tape.leaf(w), tape.leaf(b)));
-                let list: Vec<_> = leaves.iter().map(|(k, h, w, b)| (*k, *h, w, b)).collect();
-                let start = std::time::Instant::now();
-                let y = qkv.conv_relative_position(height, width, 8, &list);
-                forward.push(start.elapsed());
-                let start = std::time::Instant::now();
-                let gradients = tape.backward(&[(&y, g.clone())]);
-                back.push(start.elapsed());
-                drop(gradients);
-            }
-            forward.sort();
-            back.sort();
-            println!("4x{height}x{width}x{channels}: forward {:?}, backward {:?}", forward[20], back[20]);
-        }
-    }
 }

@@ -341,33 +341,4 @@ mod tests {
         let y = apply1(FactorisedAttention { heads: 1, tile: 2 }, &[&Var::constant(qkv)]);
         assert_eq!(y.value().data(), [2.0; 4]);
     }
-
-    #[test]
-    #[ignore = "a measurement"]
-    fn time() {
-        for (tokens, channels) in [(1920, 48), (480, 64), (120, 96), (30, 96)] {
-            let mut random = Random::new(1, 2);
-            let mut tensor = |c: usize| -> Tensor<f32> {
-                Tensor::build([4, tokens, c], |o| {
-                    o.iter_mut().for_each(|x| *x = random.uniform(-1.0, 1.0) as f32);
-                })
-            };
-            let (qkv, g) = (tensor(3 * channels), tensor(channels));
-            let (mut forward, mut back) = (Vec::new(), Vec::new());
-            for _ in 0..41 {
-                let tape = crate::tensor::Tape::new();
-                let qkv = tape.leaf(qkv.clone());
-                let start = std::time::Instant::now();
-                let y = qkv.factorised_attention(8);
-                forward.push(start.elapsed());
-                let start = std::time::Instant::now();
-                let gradients = tape.backward(&[(&y, g.clone())]);
-                back.push(start.elapsed());
-                drop(gradients);
-            }
-            forward.sort();
-            back.sort();
-            println!("4x{tokens}x{channels}: forward {:?}, backward {:?}", forward[20], back[20]);
-        }
-    }
 }

@@ -56,7 +56,9 @@ impl GridSample {
         let (n, half) = (size as f64, T::of(0.5));
         let (p, slope, low, span) = if self.align_corners {
             let slope = half * T::of(n - 1.0);
-            ((g + T::ONE) * slope, slope, T::ZERO, T::of(n - 1.0))
+            // Every place is the centre of a single pixel; that of infinity would be 0 times it.
+            let p = if size == 1 && !g.is_nan() { T::ZERO } else { (g + T::ONE) * slope };
+            (p, slope, T::ZERO, T::of(n - 1.0))
         } else {
             (((g + T::ONE) * T::of(n) - T::ONE) * half, half * T::of(n), -half, T::of(n))
         };

@@ -110,9 +110,11 @@ impl Checked for Sort {
             Case::new("descending, last axis", down(1), [x(&[3, 6])]),
             Case::new("one element", up(1), [x(&[3, 1])]),
             Case::new("a long vector", down(0), [x(&[50])]),
-            Case::new("a tie", up(0), [tie(&[2.0, 1.0, 2.0, 3.0])]).kinks(2),
-            Case::new("a descending tie of three", down(0), [tie(&[1.0, 2.0, 2.0, 0.5, 2.0])]).kinks(3),
-            Case::new("0 and -0", up(0), [tie(&[0.0, 1.0, -0.0])]).kinks(2),
+            Case::new("a tie", up(0), [tie(&[2.0, 1.0, 2.0, 3.0])]).kinks(2).promises(0, [1.0; 4]),
+            Case::new("a descending tie of three", down(0), [tie(&[1.0, 2.0, 2.0, 0.5, 2.0])])
+                .kinks(3)
+                .promises(0, [1.0; 5]),
+            Case::new("0 and -0", up(0), [tie(&[0.0, 1.0, -0.0])]).kinks(2).promises(0, [1.0; 3]),
             Case::new("nothing", up(0), [x(&[0, 3])]).flat(),
             Case::new("columns of nothing", down(0), [x(&[3, 0])]).flat(),
         ]

@@ -68,9 +68,15 @@ impl Checked for TopK {
             Case::new("smallest, last axis", small(1, 4), [x(&[3, 6])]),
             Case::new("all of them", large(1, 4), [x(&[2, 4])]),
             Case::new("one of one", small(1, 1), [x(&[3, 1])]),
-            Case::new("a tie within", large(0, 3), [tie(&[1.0, 2.0, 2.0, 5.0])]).kinks(2),
-            Case::new("a tie at the edge", large(0, 2), [tie(&[1.0, 2.0, 2.0, 5.0])]).kinks(2),
-            Case::new("a tie of the smallest at the edge", small(0, 2), [tie(&[3.0, 3.0, 1.0, 3.0])]).kinks(3),
+            Case::new("a tie within", large(0, 3), [tie(&[1.0, 2.0, 2.0, 5.0])])
+                .kinks(2)
+                .promises(0, [0.0, 1.0, 1.0, 1.0]),
+            Case::new("a tie at the edge", large(0, 2), [tie(&[1.0, 2.0, 2.0, 5.0])])
+                .kinks(2)
+                .promises(0, [0.0, 1.0, 0.0, 1.0]),
+            Case::new("a tie of the smallest at the edge", small(0, 2), [tie(&[3.0, 3.0, 1.0, 3.0])])
+                .kinks(3)
+                .promises(0, [1.0, 0.0, 1.0, 0.0]),
             Case::new("none", large(0, 0), [x(&[3, 2])]).flat(),
             Case::new("none of nothing", small(1, 0), [x(&[2, 0])]).flat(),
         ]

@@ -29,7 +29,7 @@ pub(crate) fn parked(world: &mut World, draw: &mut Draw, style: &Style, side: f6
     let furthest = (style.half - 1.1).max(nearest + 0.2);
     while z < style.end - 10.0 {
         let x = side * draw.range(nearest, furthest);
-        z += car(world, draw, x, z, side > 0.0, 0.0) + draw.range(1.0, style.car_gap);
+        z += car(world, draw, x, z, side > 0.0, 0.0) + draw.range(1.0, style.car_gap[(side > 0.0) as usize]);
     }
 }
 

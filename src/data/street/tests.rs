@@ -282,27 +282,3 @@ fn a_configuration_reads_back_and_may_leave_fields_out() {
     assert_eq!(toml::from_str::<StreetConfig>("seed = 3\nmoving_cars = true").unwrap(), config);
     assert!(toml::from_str::<StreetConfig>("sede = 3").is_err());
 }
-
-/// `STREET_PICTURES=DIR cargo test --lib pictures_to_look_at -- --ignored --nocapture`
-#[test]
-#[ignore = "writes pictures to look at, and says how long the default street takes"]
-fn pictures_to_look_at() {
-    let Some(dir) = std::env::var_os("STREET_PICTURES").map(std::path::PathBuf::from) else { return };
-    std::fs::create_dir_all(&dir).unwrap();
-    let start = std::time::Instant::now();
-    Street::render(&StreetConfig::default(), None);
-    println!("the default street: {:?}", start.elapsed());
-    let config = StreetConfig { sequences: 10, frames: 3, ..StreetConfig::default() };
-    let big = StreetConfig { sequences: 6, width: 1280, height: 384, ..config.clone() };
-    for (name, config) in [("small", config), ("big", big)] {
-        let street = Street::render(&config, None);
-        for k in 0..config.sequences {
-            street.frame(k, 1).save(dir.join(format!("{name}{k}.png"))).unwrap();
-            let depth = street.frame_depth(k, 1);
-            let shade = |z: f32| if z == 0.0 { 0 } else { (255.0 * (4.0 / z).min(1.0)) as u8 };
-            let grey: Vec<u8> = depth.metres.iter().map(|&z| shade(z)).collect();
-            let (w, h) = (depth.width as u32, depth.height as u32);
-            image::GrayImage::from_raw(w, h, grey).unwrap().save(dir.join(format!("{name}{k}_depth.png"))).unwrap();
-        }
-    }
-}

@@ -46,8 +46,8 @@ pub(crate) struct Style {
     /// Where the street begins and ends, in metres.
     pub(crate) begin: f64,
     pub(crate) end: f64,
-    /// Longest gap between parked cars, and between trees (0 for none), in metres.
-    pub(crate) car_gap: f64,
+    /// Longest gap between parked cars, left and right, and between trees (0 for none), in metres.
+    pub(crate) car_gap: [f64; 2],
     pub(crate) tree_gap: f64,
     pub(crate) foliage: Colour,
 }
@@ -68,15 +68,15 @@ impl World {
             2 if !moving_cars => draw.range(6.0, 8.5),
             _ => draw.range(5.15, 5.45),
         };
-        let mut garden = || if draw.chance(0.3) { draw.range(2.0, 9.0) } else { 0.0 };
+        let mut garden = || if draw.chance(0.4) { draw.range(2.0, 12.0) } else { 0.0 };
         let setback = [garden(), garden()];
         let style = Style {
             half,
             setback,
-            open: [draw.chance(0.25), draw.chance(0.25)],
+            open: [draw.chance(0.3), draw.chance(0.3)],
             begin: -12.0,
             end: travel + FAR as f64,
-            car_gap: draw.pick(&[4.0, 7.0, 12.0, 14.0, 20.0, 45.0]),
+            car_gap: [draw.pick(&CAR_GAPS), draw.pick(&CAR_GAPS)],
             tree_gap: draw.pick(&[0.0, 9.0, 16.0, 30.0]),
             foliage: vary(draw, GREEN, 0.04, 0.06),
         };
@@ -178,6 +178,8 @@ impl World {
     }
 }
 
+/// From bumper to bumper, to hardly a car.
+const CAR_GAPS: [f64; 6] = [4.0, 7.0, 12.0, 14.0, 20.0, 60.0];
 /// Leaves and paving, before they vary.
 const GREEN: [f64; 3] = [0.27, 0.37, 0.17];
 const STONE: [f64; 3] = [0.56, 0.54, 0.51];
