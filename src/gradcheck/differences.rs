@@ -132,12 +132,13 @@ struct Prober<'a, F> {
 impl<F: Fn(&[Tensor<f64>]) -> Vec<Tensor<f64>>> Prober<'_, F> {
     /// The quotient along a movement: (input, element, how far) of each element that moves.
     fn probe(&self, movement: &[(usize, usize, f64)]) -> Quotient {
-        let largest = movement.iter().fold(1.0, |m: f64, &(i, k, _)| m.max(self.inputs[i].data()[k].abs()));
+        let largest = movement.iter().map(|&(i, k, _)| self.inputs[i].data()[k].abs());
+        let largest = largest.filter(|x| x.is_finite()).fold(1.0, f64::max);
         let mut h = self.options.step * largest;
         if let [(i, k, _)] = *movement {
             // The step that is really taken, after rounding.
             let x = self.inputs[i].data()[k];
-            h = (x + h) - x;
+            h = if x.is_finite() { (x + h) - x } else { h };
         }
         let at = |h: f64| {
             let mut moved = self.inputs.to_vec();

@@ -5,7 +5,7 @@ use std::fmt;
 use serde::Serialize;
 
 use super::Gradients;
-use super::differences::{Differences, Measured};
+use super::differences::{Differences, Measured, Tie};
 use super::options::{Kinks, Options};
 
 /// What the check of one input found.
@@ -26,7 +26,7 @@ pub struct InputReport {
     pub scale: f64,
     /// Derivatives compared.
     pub elements: usize,
-    /// Elements at a kink: they are held between their one-sided derivatives.
+    /// Elements at a kink: they are held between their one-sided derivatives, or in sum where they tie.
     pub kinks: Vec<usize>,
     /// Whether every difference is within the tolerance.
     pub within: bool,
@@ -48,8 +48,14 @@ pub struct Outside {
 }
 
 impl InputReport {
-    /// `rows` are the gradient of the input and its differences, for each cotangent.
-    fn new(name: String, rows: &[(&[f64], &Differences)], options: &Options) -> Self {
+    /// `rows` are the gradient of the input and its differences, for each cotangent; `tied` says which elements of a row
+    /// are held to what they have together with others.
+    fn new(
+        name: String,
+        rows: &[(&[f64], &Differences)],
+        tied: impl Fn(usize, usize) -> bool,
+        options: &Options,
+    ) -> Self {
         let largest = |m: f64, g: &f64| if g.is_nan() || m.is_nan() { f64::NAN } else { m.max(g.abs()) };
         let analytic: Vec<Vec<f64>> = rows.iter().map(|(g, d)| d.along(g)).collect();
         let scale = analytic.iter().flatten().fold(0.0, largest);
@@ -68,7 +74,7 @@ impl InputReport {
             outside: None,
         };
         let mut share = 0.0;
-        for (analytic, (_, differences)) in analytic.iter().zip(rows) {
+        for (row, (analytic, (_, differences))) in analytic.iter().zip(rows).enumerate() {
             for (k, (&a, q)) in analytic.iter().zip(&differences.quotients).enumerate() {
                 r.elements += 1;
                 if q.is_kink(size) {
@@ -77,7 +83,7 @@ impl InputReport {
                     }
                     // One-sided quotients are off by half the curvature times the step.
                     let slack = 1e-3 * size.max(q.left.abs()).max(q.right.abs());
-                    if !(q.low - slack..=q.high + slack).contains(&a) {
+                    if !tied(row, k) && !(q.low - slack..=q.high + slack).contains(&a) {
                         r.outside = Some(Outside { element: k, analytic: a, low: q.low, high: q.high });
                     }
                     continue;
@@ -116,7 +122,11 @@ impl Report {
         let count = rows.first().map_or(0, |(g, _)| g.inputs.len());
         let input = |i: usize| {
             let pairs = rows.iter().map(|(g, m)| Some((g.inputs[i].as_ref()?.data(), m.inputs[i].as_ref()?)));
-            Some(InputReport::new(options.name(i), &pairs.collect::<Option<Vec<_>>>()?, options))
+            let tied = |row: usize, k: usize| {
+                let ties: &[Tie] = &rows[row].1.ties;
+                ties.iter().any(|tie| tie.members.contains(&(i, k)))
+            };
+            Some(InputReport::new(options.name(i), &pairs.collect::<Option<Vec<_>>>()?, tied, options))
         };
         let inputs: Vec<_> = (0..count).map(input).collect();
         let ties = rows.iter().map(|(_, m)| m.ties.len()).sum();

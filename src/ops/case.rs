@@ -49,6 +49,13 @@ pub enum Fill {
         /// The greatest.
         high: f64,
     },
+    /// Uniform random numbers, the same for every seed: where a draw could fall on a kink.
+    Fixed {
+        /// The least.
+        low: f64,
+        /// The greatest.
+        high: f64,
+    },
     /// These numbers.
     Values(Vec<f64>),
 }
@@ -75,7 +82,17 @@ impl Input {
 
     /// Different numbers in [-1, 1], evenly spaced, in random order: for ops that compare.
     pub fn distinct(name: &'static str, shape: impl Into<Shape>) -> Self {
-        Self::new(name, shape, Fill::Distinct { low: -1.0, high: 1.0 })
+        Self::distinct_in(name, shape, -1.0, 1.0)
+    }
+
+    /// Different numbers, evenly spaced between two others, in random order.
+    pub fn distinct_in(name: &'static str, shape: impl Into<Shape>, low: f64, high: f64) -> Self {
+        Self::new(name, shape, Fill::Distinct { low, high })
+    }
+
+    /// Uniform random numbers that are the same for every seed: for kinks that lie where no rule can keep away from.
+    pub fn fixed(name: &'static str, shape: impl Into<Shape>, low: f64, high: f64) -> Self {
+        Self::new(name, shape, Fill::Fixed { low, high })
     }
 
     /// Given numbers.
@@ -120,6 +137,10 @@ impl Input {
                 let mut all: Vec<f64> = (0..n).map(|i| low + (high - low) * (i as f64 + 0.5) / n as f64).collect();
                 random.shuffle(&mut all);
                 all
+            }
+            Fill::Fixed { low, high } => {
+                let mut random = Random::new(0, 8);
+                (0..n).map(|_| random.uniform(*low, *high)).collect()
             }
             Fill::Values(values) => values.clone(),
         };
@@ -173,6 +194,12 @@ impl<O> Case<O> {
     /// Says that this many elements sit on a kink; which value the op has there is [promised](Case::promises).
     pub fn kinks(mut self, count: usize) -> Self {
         self.kinks = count;
+        self
+    }
+
+    /// Says that the gradient of an input may rightly be zero here, though others are not.
+    pub fn ignores(mut self, input: usize) -> Self {
+        self.inputs[input].ignored = true;
         self
     }
 

@@ -63,7 +63,12 @@ impl Checked for Photometric {
     fn cases() -> Vec<Case<Self>> {
         let op = |ssim_weight, tile| Photometric { ssim_weight, tile };
         let images = |shape: [usize; 4]| {
-            [Input::uniform("prediction", shape, 0.0, 1.0), Input::uniform("target", shape, 0.0, 1.0)]
+            // Evenly spaced, and a quarter of the spacing apart: no pixel of one equals one of the other.
+            let quarter = 0.25 / shape.iter().product::<usize>() as f64;
+            [
+                Input::distinct_in("prediction", shape, 0.0, 1.0),
+                Input::distinct_in("target", shape, quarter, 1.0 + quarter),
+            ]
         };
         let equal = |name| Input::values(name, [1, 2, 2, 1], [0.3, 0.8, 0.1, 0.6]);
         vec![

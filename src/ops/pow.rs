@@ -36,9 +36,9 @@ impl binary::Function for Pow {
         let b = |values: &[f64]| Input::values("b", [values.len()], values);
         let whole = b(&[3.0, 2.0, -1.0, 1.0, 0.0]).constant("a negative number has only whole powers");
         vec![
-            Case::new("of zero", op, [a(&[0.0; 4]), b(&[1.0, 2.0, 3.0, 4.0])]),
+            Case::new("of zero", op, [a(&[0.0; 4]), b(&[1.0, 2.0, 3.0, 4.0])]).ignores(1),
             Case::new("of negative numbers", op, [a(&[-2.0, -0.5, -1.5, -0.7, -3.0]), whole]),
-            Case::new("to the power 0", op, [a(&[0.5, 2.0, 1.0]), b(&[0.0, 0.0, 0.0])]),
+            Case::new("to the power 0", op, [a(&[0.5, 2.0, 1.0]), b(&[0.0, 0.0, 0.0])]).ignores(0),
             Case::new("negative exponents", op, [Input::values("a", [2, 1], [0.5, 2.0]), b(&[-1.0, -1.5])]),
         ]
     }

@@ -82,12 +82,19 @@ impl Checked for Select {
             Case::new(name, Select, [condition(shape, values), yes, no])
         };
         let mixed: Vec<f64> = (0..2 * 3 * 2 * 2).map(|i| [0.0, 1.0, -2.5, 0.0, 1e-30][i % 5]).collect();
+        let (nan, inf) = (f64::NAN, f64::INFINITY);
+        let dead = [
+            condition(&[4], &[1.0, 0.0, 1.0, 0.0]),
+            Input::values("yes", [4], [0.5, nan, -2.0, -inf]),
+            Input::values("no", [4], [inf, -1.0, nan, 3.0]),
+        ];
         vec![
             case("mixed", &[2, 3, 2, 2], &mixed),
             case("both zeros", &[4], &[0.0, -0.0, 1.0, f64::NAN]),
-            case("all yes", &[2, 2], &[1.0; 4]),
-            case("all no", &[2, 2], &[0.0; 4]),
-            case("a scalar", &[], &[1.0]),
+            Case::new("infinite or NaN where not chosen", Select, dead),
+            case("all yes", &[2, 2], &[1.0; 4]).ignores(2),
+            case("all no", &[2, 2], &[0.0; 4]).ignores(1),
+            case("a scalar", &[], &[1.0]).ignores(2),
             case("empty", &[3, 0], &[]).flat(),
         ]
     }

@@ -6,6 +6,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use parallax::gradcheck::{Gradients, Report, check_case};
 use parallax::ops::case::TOLERANCE;
 use parallax::ops::registry;
+use parallax::ops::{Case, Checked, CustomOp, Input, Needs, Op, ShapeError};
+use parallax::tensor::{Float, GradSink, Shape, Tensor, Upstream};
 
 use crate::checks::{CHECKS, Subject};
 
@@ -77,23 +79,85 @@ fn twenty_seeds_raise_no_false_alarm() {
     assert!(failures.is_empty(), "{} false alarms:\n{}", failures.len(), failures.join("\n"));
 }
 
-#[test]
-fn every_op_has_cases_and_every_input_is_perturbed_somewhere() {
-    for entry in registry::all() {
-        let cases = entry.cases();
-        assert!(!cases.is_empty(), "{}: no cases", entry.name);
-        assert!(cases.iter().any(|c| !c.flat()), "{}: every case is flat", entry.name);
-        let names: BTreeSet<&str> = cases.iter().flat_map(|c| c.inputs()).map(|i| i.name).collect();
-        for name in names {
-            let uses = || cases.iter().filter(|c| !c.flat()).flat_map(|c| c.inputs()).filter(|i| i.name == name);
-            let perturbed = uses().any(|i| i.constant.is_none() && !i.shape.is_empty());
-            let declared = uses().all(|i| i.constant.is_some_and(|reason| !reason.is_empty()));
-            assert!(perturbed || declared, "{}: input {name} is perturbed in no case", entry.name);
-        }
-        for case in cases.iter().filter(|c| c.kinks() > 0) {
-            assert!(case.promise().is_some(), "{} \"{}\": which value at its kinks?", entry.name, case.name());
+/// What the cases of an op leave open, if anything.
+fn gap(entry: &registry::Entry) -> Option<String> {
+    let cases = entry.cases();
+    if cases.is_empty() {
+        return Some("no cases".into());
+    }
+    if cases.iter().all(|c| c.flat()) {
+        return Some("every case is flat".into());
+    }
+    let names: BTreeSet<&str> = cases.iter().flat_map(|c| c.inputs()).map(|i| i.name).collect();
+    for name in names {
+        let uses = || cases.iter().filter(|c| !c.flat()).flat_map(|c| c.inputs()).filter(|i| i.name == name);
+        let perturbed = uses().any(|i| i.constant.is_none() && !i.shape.is_empty());
+        let declared = uses().all(|i| i.constant.is_some_and(|reason| !reason.is_empty()));
+        if !perturbed && !declared {
+            return Some(format!("input {name} is perturbed in no case"));
         }
     }
+    let silent = cases.iter().find(|c| c.kinks() > 0 && c.promise().is_none());
+    silent.map(|case| format!("\"{}\" does not say which value it has on its kinks", case.name()))
+}
+
+#[test]
+fn every_op_has_cases_and_every_input_is_perturbed_somewhere() {
+    let open: Vec<_> = registry::all().iter().filter_map(|e| Some((e.name, gap(e)?))).collect();
+    assert!(open.is_empty(), "{open:?}");
+}
+
+/// An op whose cases are whatever a test wants: y = x.
+#[derive(Clone)]
+struct Identity<const WHICH: usize>;
+
+impl<const WHICH: usize> CustomOp for Identity<WHICH> {
+    const NAME: &'static str = "identity";
+}
+
+impl<const WHICH: usize> Checked for Identity<WHICH> {
+    fn cases() -> Vec<Case<Self>> {
+        let case = |input| Case::new("a case", Identity, [input]);
+        match WHICH {
+            0 => vec![],
+            1 => vec![case(Input::random("x", [0])).flat()],
+            2 => vec![case(Input::random("x", [0]))],
+            3 => vec![case(Input::random("x", [2]).constant(""))],
+            4 => vec![case(Input::random("x", [2])).kinks(1)],
+            _ => vec![case(Input::random("x", [2]))],
+        }
+    }
+}
+
+impl<T: Float, const WHICH: usize> Op<T> for Identity<WHICH> {
+    type Saved = ();
+    fn shape(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError> {
+        Ok(vec![inputs[0]])
+    }
+    fn forward(&self, x: &[&Tensor<T>], _: &Needs) -> (Vec<Tensor<T>>, ()) {
+        (vec![x[0].clone()], ())
+    }
+    fn backward(&self, _: (), upstream: Upstream<T>, sink: &mut GradSink<T>) {
+        sink.give(0, upstream.only());
+    }
+}
+
+#[test]
+fn an_op_whose_cases_show_nothing_is_refused() {
+    use registry::Entry;
+    let found = [
+        gap(&Entry::of::<Identity<0>>()),
+        gap(&Entry::of::<Identity<1>>()),
+        gap(&Entry::of::<Identity<2>>()),
+        gap(&Entry::of::<Identity<3>>()),
+        gap(&Entry::of::<Identity<4>>()),
+        gap(&Entry::of::<Identity<5>>()),
+    ];
+    let said = ["no cases", "every case is flat", "perturbed in no case", "perturbed in no case", "on its kinks"];
+    for (found, said) in found.iter().zip(said) {
+        assert!(found.as_ref().is_some_and(|gap| gap.contains(said)), "{found:?}, not {said}");
+    }
+    assert_eq!(found[5], None);
 }
 
 /// What the suite lets pass for a stated reason. The numbers are pinned, so that none grows unseen.
@@ -119,4 +183,4 @@ fn exceptions_are_counted() {
 
 /// Elements on kinks, cases with a loosened tolerance, inputs that are declared not differentiable, inputs whose
 /// gradient is rightly zero in a case.
-const EXCEPTIONS: [usize; 4] = [36, 2, 3, 44];
+const EXCEPTIONS: [usize; 4] = [65, 2, 10, 50];

@@ -55,8 +55,8 @@ impl Conv2d {
         Conv2d { reflect: true, ..self }
     }
 
-    fn is_pointwise(&self, w: &Shape) -> bool {
-        w.dims()[..2] == [1, 1] && self.stride == [1; 2] && self.padding == [0; 2] && self.groups == 1
+    fn is_pointwise(&self, kernel: [usize; 2]) -> bool {
+        kernel == [1, 1] && self.stride == [1; 2] && self.padding == [0; 2] && self.groups == 1
     }
 }
 
@@ -76,7 +76,7 @@ impl<T: Float> Op<T> for Conv2d {
 
     fn algo(&self, inputs: &[Shape]) -> &'static str {
         match () {
-            _ if self.is_pointwise(&inputs[1]) => "pointwise",
+            _ if self.is_pointwise([inputs[1].dims()[0], inputs[1].dims()[1]]) => "pointwise",
             _ if self.groups > 1 => "grouped",
             _ if self.reflect => "im2col_reflect",
             _ if self.stride != [1; 2] => "im2col_strided",
@@ -95,7 +95,7 @@ impl<T: Float> Op<T> for Conv2d {
         let (x, w, b) = (inputs[0], inputs[1], inputs.get(2).map(|b| b.data()));
         let g = Geometry::new(self, x.shape(), w.shape()).expect("checked by the shape rule");
         let y = Tensor::build([g.batch, g.out[0], g.out[1], g.out_channels], |out| {
-            if self.is_pointwise(w.shape()) {
+            if self.is_pointwise(g.kernel) {
                 linear::forward(out, Rows::dense(x.data(), x.shape().rows(), g.channels), w.data(), b, 0);
             } else {
                 kernel::convolve(out, crate::tensor::Accum::Replace, &g, x.data(), w.data(), b);
@@ -110,7 +110,7 @@ impl<T: Float> Op<T> for Conv2d {
     fn backward(&self, (x, w, g): Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
         let dy = upstream.only();
         if let Some(w) = w {
-            sink.accumulate(0, |out, accum| match self.is_pointwise(w.shape()) {
+            sink.accumulate(0, |out, accum| match self.is_pointwise(g.kernel) {
                 true => linear::input_gradient(
                     out,
                     accum,
@@ -122,8 +122,8 @@ impl<T: Float> Op<T> for Conv2d {
             });
         }
         if let Some(x) = x {
-            let (rows, out_rows) = (x.shape().rows(), dy.shape().rows());
-            sink.accumulate(1, |out, accum| match rows == out_rows && g.kernel == [1, 1] && self.groups == 1 {
+            let rows = x.shape().rows();
+            sink.accumulate(1, |out, accum| match self.is_pointwise(g.kernel) {
                 true => linear::weight_gradient(
                     out,
                     accum,
@@ -181,6 +181,14 @@ impl Checked for Conv2d {
             case("reflected, stride 2", same.reflecting().strided(2), [1, 4, 5, 2], [3, 3, 2, 2], false),
             case("1x1", Conv2d::default(), [2, 3, 4, 5], [1, 1, 5, 3], true),
             case("1x1 without bias", Conv2d::default(), [2, 3, 4, 5], [1, 1, 5, 3], false),
+            // Strides and padding that cancel: as many pixels as before, but not the same ones.
+            case(
+                "1x1, strided and padded to the same size",
+                Conv2d { stride: [1, 2], padding: [0, 3], ..Conv2d::default() },
+                [1, 1, 6, 2],
+                [1, 1, 2, 3],
+                true,
+            ),
             case("tile less one", Conv2d { tile: 4, ..same }, [1, 3, 3, 2], [3, 3, 2, 2], false),
             case("a whole tile", Conv2d { tile: 4, ..same }, [1, 4, 3, 2], [3, 3, 2, 2], false),
             case("tile and one", Conv2d { tile: 4, ..same }, [1, 5, 3, 2], [3, 3, 2, 2], false),
