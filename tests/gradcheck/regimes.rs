@@ -207,8 +207,9 @@ fn single_precision_follows_over_every_vector_remainder() {
             if paths[case.algo()] > 3 || case.flat() {
                 continue;
             }
-            for n in 1..=67 {
-                let Some(inputs) = widened(case.as_ref(), n) else { continue };
+            let sources = 0..case.inputs().len();
+            for (n, source) in (1..=67).flat_map(|n| sources.clone().map(move |source| (n, source))) {
+                let Some(inputs) = widened(case.as_ref(), source, n) else { continue };
                 *lengths.entry(entry.name).or_default() += 1;
                 let single: Vec<Var<f32>> = inputs.iter().map(|x| Var::constant(x.cast())).collect();
                 let found = case.run_f32(&single.iter().collect::<Vec<_>>());
@@ -243,9 +244,21 @@ fn single_precision_follows_over_every_vector_remainder() {
         println!("{op:28} {count:4} sizes, at most {:6.2} roundings", worst.get(op).copied().unwrap_or(0.0));
     }
     assert!(failures.is_empty(), "{} failures:\n{}", failures.len(), failures.join("\n"));
-    let covered = lengths.values().filter(|count| **count >= 67).count();
-    assert!(covered >= 50, "only {covered} ops were widened to every length");
+    for entry in registry::all() {
+        let (count, fixed) = (lengths.get(entry.name).copied().unwrap_or(0), FIXED.iter().any(|f| f.0 == entry.name));
+        // Indices and choices that are given do not fit the smallest extents.
+        assert!((count < 65) == fixed, "{} was widened to {count} sizes", entry.name);
+    }
 }
+
+/// Ops that cannot be widened to every extent, and why.
+const FIXED: [(&str, &str); 5] = [
+    ("axis_angle_to_rotation", "three numbers"),
+    ("pose_matrix", "three numbers"),
+    ("cross", "three numbers"),
+    ("reshape", "moves nothing"),
+    ("conv_relative_position", "three inputs widen together by the same factor: its cases have several widths"),
+];
 
 /// Ops whose error is in units of 1, and why.
 const LOOSE: [(&str, &str); 1] =
@@ -254,10 +267,14 @@ const LOOSE: [(&str, &str); 1] =
 /// The error of an output in f32, in units of its condition times the machine epsilon.
 const ROUNDINGS: f64 = 16.0;
 
-/// The inputs of a case with the innermost extent of the first one changed to `n` wherever it occurs as an innermost
-/// one, rounded to f32; `None` if the op does not take them.
-fn widened(case: &dyn AnyCase, n: usize) -> Option<Vec<Tensor<f64>>> {
-    let first = case.inputs().first()?.shape;
+/// The inputs of a case with the innermost extent of one of them changed to `n` wherever it occurs as an innermost one
+/// (channels in of the first, channels out of the weights), rounded to f32; `None` if the op does not take them.
+fn widened(case: &dyn AnyCase, source: usize, n: usize) -> Option<Vec<Tensor<f64>>> {
+    let first = case.inputs()[source].shape;
+    if case.inputs()[..source].iter().any(|input| input.shape.last() == first.last()) {
+        // Another input has been the source of the same change.
+        return None;
+    }
     let given = |input: &Input| matches!(input.fill, Fill::Values(_));
     if n < first.last() && case.inputs().iter().any(|input| given(input) && input.constant.is_some()) {
         // Indices would point outside.
@@ -267,10 +284,14 @@ fn widened(case: &dyn AnyCase, n: usize) -> Option<Vec<Tensor<f64>>> {
     for input in &mut inputs {
         let rank = input.shape.rank();
         if rank > 0 && input.shape.last() == first.last() {
-            if given(input) {
-                return None;
-            }
             input.shape = input.shape.with(rank - 1, n);
+            // Given numbers are given again and again.
+            if let Fill::Values(values) = &mut input.fill {
+                if values.is_empty() || case.kinks() > 0 || values.iter().any(|x| !x.is_finite()) {
+                    return None;
+                }
+                *values = values.iter().copied().cycle().take(input.shape.len()).collect();
+            }
         }
     }
     let shapes: Vec<Shape> = inputs.iter().map(|i| i.shape).collect();
