@@ -66,6 +66,8 @@ pub struct Tie {
     pub members: Vec<(usize, usize)>,
     /// The quotient along their common movement.
     pub quotient: Quotient,
+    /// Between what each member's own derivative must lie: every output takes its one-sided ones or the common one.
+    pub bounds: Vec<[f64; 2]>,
 }
 
 /// The whole numeric side.
@@ -130,8 +132,8 @@ struct Prober<'a, F> {
 }
 
 impl<F: Fn(&[Tensor<f64>]) -> Vec<Tensor<f64>>> Prober<'_, F> {
-    /// The quotient along a movement: (input, element, how far) of each element that moves.
-    fn probe(&self, movement: &[(usize, usize, f64)]) -> Quotient {
+    /// The step along a movement: (input, element, how far) of each element that moves.
+    fn step(&self, movement: &[(usize, usize, f64)]) -> f64 {
         let largest = movement.iter().map(|&(i, k, _)| self.inputs[i].data()[k].abs());
         let largest = largest.filter(|x| x.is_finite()).fold(1.0, f64::max);
         let mut h = self.options.step * largest;
@@ -140,11 +142,20 @@ impl<F: Fn(&[Tensor<f64>]) -> Vec<Tensor<f64>>> Prober<'_, F> {
             let x = self.inputs[i].data()[k];
             h = if x.is_finite() { (x + h) - x } else { h };
         }
-        let at = |h: f64| {
-            let mut moved = self.inputs.to_vec();
-            movement.iter().for_each(|&(i, k, far)| moved[i].data_mut()[k] += h * far);
-            (self.evaluate)(&moved)
-        };
+        h
+    }
+
+    /// The outputs after a movement by `h`.
+    fn at(&self, movement: &[(usize, usize, f64)], h: f64) -> Vec<Tensor<f64>> {
+        let mut moved = self.inputs.to_vec();
+        movement.iter().for_each(|&(i, k, far)| moved[i].data_mut()[k] += h * far);
+        (self.evaluate)(&moved)
+    }
+
+    /// The quotient along a movement.
+    fn probe(&self, movement: &[(usize, usize, f64)]) -> Quotient {
+        let h = self.step(movement);
+        let at = |h: f64| self.at(movement, h);
         let (above, below) = (at(h), at(-h));
         let mut q = Quotient { central: 0.0, left: 0.0, right: 0.0, low: 0.0, high: 0.0 };
         for_each_number(self.cotangents, [&above, &self.centre, &below], |c, [above, centre, below]| {
@@ -165,6 +176,31 @@ impl<F: Fn(&[Tensor<f64>]) -> Vec<Tensor<f64>>> Prober<'_, F> {
         }
         q
     }
+
+    /// Between what the derivative of one member of a tie must lie.
+    fn bounds(&self, member: (usize, usize), together: &[(usize, usize, f64)]) -> [f64; 2] {
+        let alone = [(member.0, member.1, 1.0)];
+        let (h, common) = (self.step(&alone), self.step(together));
+        let (above, below) = (self.at(&alone, h), self.at(&alone, -h));
+        let (all_above, all_below) = (self.at(together, common), self.at(together, -common));
+        let (mut low, mut high) = (0.0, 0.0);
+        let outputs = [&above, &self.centre, &below, &all_above, &all_below];
+        for_each_number(
+            self.cotangents,
+            outputs.map(Vec::as_slice),
+            |c, [above, centre, below, all_above, all_below]| {
+                let slopes = [
+                    change(above, centre) / h,
+                    change(centre, below) / h,
+                    change(all_above, all_below) / (2.0 * common),
+                ];
+                let slopes = slopes.map(|slope| c * slope);
+                low += slopes.into_iter().fold(f64::INFINITY, f64::min);
+                high += slopes.into_iter().fold(f64::NEG_INFINITY, f64::max);
+            },
+        );
+        [low, high]
+    }
 }
 
 /// a - b; an infinity that does not move has no slope of its own, and must not become NaN.
@@ -172,7 +208,12 @@ fn change(a: f64, b: f64) -> f64 {
     if a == b { 0.0 } else { a - b }
 }
 
-fn for_each_number(cotangents: &[Option<Tensor<f64>>], outputs: [&[Tensor<f64>]; 3], mut f: impl FnMut(f64, [f64; 3])) {
+/// Calls `f` with every cotangent that is not zero, and the number that it belongs to in each of several outputs.
+fn for_each_number<const N: usize>(
+    cotangents: &[Option<Tensor<f64>>],
+    outputs: [&[Tensor<f64>]; N],
+    mut f: impl FnMut(f64, [f64; N]),
+) {
     for (o, c) in cotangents.iter().enumerate() {
         let Some(c) = c else { continue };
         for (k, &c) in c.data().iter().enumerate() {
@@ -200,10 +241,14 @@ fn ties<F: Fn(&[Tensor<f64>]) -> Vec<Tensor<f64>>>(prober: &Prober<F>, found: &[
     }
     let groups = groups.into_values().filter(|members| members.len() > 1);
     groups
-        .map(|members| {
+        .filter_map(|members| {
             let movement: Vec<_> = members.iter().map(|&(i, k)| (i, k, 1.0)).collect();
-            Tie { quotient: prober.probe(&movement), members }
+            let quotient = prober.probe(&movement);
+            if quotient.is_kink(scale) {
+                return None;
+            }
+            let bounds = members.iter().map(|&member| prober.bounds(member, &movement)).collect();
+            Some(Tie { members, quotient, bounds })
         })
-        .filter(|tie| !tie.quotient.is_kink(scale))
         .collect()
 }

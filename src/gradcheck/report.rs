@@ -26,7 +26,7 @@ pub struct InputReport {
     pub scale: f64,
     /// Derivatives compared.
     pub elements: usize,
-    /// Elements at a kink: they are held between their one-sided derivatives, or in sum where they tie.
+    /// Elements at a kink: they are held between their one-sided derivatives, and in sum where they tie.
     pub kinks: Vec<usize>,
     /// Whether every difference is within the tolerance.
     pub within: bool,
@@ -48,12 +48,12 @@ pub struct Outside {
 }
 
 impl InputReport {
-    /// `rows` are the gradient of the input and its differences, for each cotangent; `tied` says which elements of a row
-    /// are held to what they have together with others.
+    /// `rows` are the gradient of the input and its differences, for each cotangent; `tied` gives the bounds of those
+    /// elements of a row that tie with others.
     fn new(
         name: String,
         rows: &[(&[f64], &Differences)],
-        tied: impl Fn(usize, usize) -> bool,
+        tied: impl Fn(usize, usize) -> Option<[f64; 2]>,
         options: &Options,
     ) -> Self {
         let largest = |m: f64, g: &f64| if g.is_nan() || m.is_nan() { f64::NAN } else { m.max(g.abs()) };
@@ -83,8 +83,9 @@ impl InputReport {
                     }
                     // One-sided quotients are off by half the curvature times the step.
                     let slack = 1e-3 * size.max(q.left.abs()).max(q.right.abs());
-                    if !tied(row, k) && !(q.low - slack..=q.high + slack).contains(&a) {
-                        r.outside = Some(Outside { element: k, analytic: a, low: q.low, high: q.high });
+                    let [low, high] = tied(row, k).unwrap_or([q.low, q.high]);
+                    if !(low - slack..=high + slack).contains(&a) {
+                        r.outside = Some(Outside { element: k, analytic: a, low, high });
                     }
                     continue;
                 }
@@ -124,7 +125,8 @@ impl Report {
             let pairs = rows.iter().map(|(g, m)| Some((g.inputs[i].as_ref()?.data(), m.inputs[i].as_ref()?)));
             let tied = |row: usize, k: usize| {
                 let ties: &[Tie] = &rows[row].1.ties;
-                ties.iter().any(|tie| tie.members.contains(&(i, k)))
+                let place = |tie: &Tie| tie.members.iter().position(|&m| m == (i, k)).map(|m| tie.bounds[m]);
+                ties.iter().find_map(place)
             };
             Some(InputReport::new(options.name(i), &pairs.collect::<Option<Vec<_>>>()?, tied, options))
         };

@@ -237,4 +237,8 @@ fn tied_elements_are_held_to_what_they_have_together() {
     // Each of them gets the whole gradient: each lies between its one-sided derivatives, but not their sum.
     let why = failure(share(|_, g| vec![g.iter().sum::<f64>(); 3]), &tie, &any);
     assert!(why.contains("the tied elements [(0, 0), (0, 1), (0, 2)]"), "{why}");
+    // The right sum of wrong parts.
+    let parts = |_: &[f64], g: &[f64]| [5.0, -4.0, 0.0].map(|part| part * g.iter().sum::<f64>()).to_vec();
+    let why = failure(share(parts), &tie, &any);
+    assert!(why.contains("at a kink"), "{why}");
 }
