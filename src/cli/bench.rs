@@ -7,7 +7,7 @@ use parallax::Result;
 use parallax::data::batch::Batch;
 use parallax::monovit::Trainer;
 use parallax::monovit::run::RunConfig;
-use parallax::nn::Context;
+use parallax::nn::Folded;
 use parallax::ops::trace::{self, Entry};
 use parallax::random::Random;
 use parallax::tensor::{Tensor, Var, pool};
@@ -73,10 +73,8 @@ pub fn run(args: Args) -> Result<()> {
     config.loss.shake.keep = 0;
     let mut trainer = Trainer::new(config.model(), config.optim, config.loss, 0);
     let batch = batch(sizes);
-    let infer = |trainer: &Trainer| {
-        let c = Context::inference(&trainer.params);
-        trainer.model.disparities(&c, &Var::constant(batch.seen[1].clone()));
-    };
+    let folded = Folded::new(&trainer.params);
+    let infer = |trainer: &Trainer| trainer.model.predict(&folded, &batch.seen[1]);
     let once = |trainer: &mut Trainer| match step {
         true => trainer.step(&batch).map(drop),
         false => {

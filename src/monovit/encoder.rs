@@ -4,9 +4,8 @@
 //! embedding through transformer layers and the first one through a convolutional block beside them, and fuses all.
 
 use super::config::Config;
-use crate::nn::{BatchNorm, Builder, Context, Conv, ConvBn, ConvStart, DepthwiseConv, Init, LayerNorm, Linear};
-use crate::ops::Conv2d;
-use crate::ops::batch_norm::Activation;
+use crate::nn::{Builder, Context, Conv, ConvBn, ConvStart, DepthwiseConv, Init, LayerNorm, Linear, Normalised};
+use crate::ops::{Activation, Conv2d};
 use crate::tensor::{Float, Var};
 
 /// RGB in [0, 1], `[B, H, W, 3]` with H and W multiples of 32, to five maps at 1/2, 1/4, 1/8, 1/16, 1/32.
@@ -71,8 +70,7 @@ impl Encoder {
 #[derive(Clone, Debug)]
 struct PatchEmbedding {
     depthwise: DepthwiseConv,
-    pointwise: Conv,
-    bn: BatchNorm,
+    pointwise: ConvBn,
 }
 
 impl PatchEmbedding {
@@ -80,13 +78,13 @@ impl PatchEmbedding {
         let init = b.start(Init::he(3, channels), 9);
         PatchEmbedding {
             depthwise: DepthwiseConv::new(&mut b.at("dwconv"), channels, 3, stride, init, false),
-            pointwise: Conv::new(&mut b.at("pwconv"), [channels; 2], 1, Conv2d::default(), ConvStart::He),
-            bn: BatchNorm::new(&mut b.at("bn"), channels, Activation::Hardswish),
+            pointwise: Conv::new(&mut b.at("pwconv"), [channels; 2], 1, Conv2d::default(), ConvStart::He)
+                .normalised(&mut b.at("bn"), Activation::Hardswish),
         }
     }
 
     fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
-        self.bn.forward(c, &self.pointwise.forward(c, &self.depthwise.forward(c, x)))
+        self.pointwise.forward(c, &self.depthwise.forward(c, x))
     }
 }
 
@@ -122,8 +120,7 @@ impl JointLayer {
 #[derive(Clone, Debug)]
 struct InvertedResidual {
     conv1: ConvBn,
-    depthwise: DepthwiseConv,
-    norm: BatchNorm,
+    depthwise: Normalised<DepthwiseConv>,
     conv2: ConvBn,
 }
 
@@ -133,15 +130,15 @@ impl InvertedResidual {
         let init = b.start(Init::he(3, 1), 9);
         InvertedResidual {
             conv1: ConvBn::new(&mut b.at("conv1"), [channels; 2], 1, 1, Activation::Hardswish),
-            depthwise: DepthwiseConv::new(&mut b.at("dwconv"), channels, 3, 1, init, false),
-            norm: BatchNorm::new(&mut b.at("norm"), channels, Activation::Hardswish),
+            depthwise: DepthwiseConv::new(&mut b.at("dwconv"), channels, 3, 1, init, false)
+                .normalised(&mut b.at("norm"), Activation::Hardswish),
             conv2: ConvBn::new(&mut b.at("conv2"), [channels; 2], 1, 1, Activation::None),
         }
     }
 
     fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
         let h = self.depthwise.forward(c, &self.conv1.forward(c, x));
-        x + self.conv2.forward(c, &self.norm.forward(c, &h))
+        x + self.conv2.forward(c, &h)
     }
 }
 

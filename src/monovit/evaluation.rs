@@ -7,8 +7,7 @@ use crate::data::Dataset;
 use crate::data::augment::flip;
 use crate::data::batch::to_tensor;
 use crate::error::{Error, Result};
-use crate::nn::{Context, Params};
-use crate::tensor::Var;
+use crate::nn::{Folded, Params};
 use image::RgbImage;
 
 /// How to predict and to compare.
@@ -25,7 +24,7 @@ pub struct Evaluation {
 /// A predictor: the networks with weights in evaluation mode.
 pub struct Predictor<'a> {
     model: &'a MonoVit,
-    context: Context<f32>,
+    params: Folded<f32>,
     nearest: f32,
     farthest: f32,
 }
@@ -34,26 +33,26 @@ impl<'a> Predictor<'a> {
     /// The networks with these weights; `config` gives the range of depths.
     pub fn new(model: &'a MonoVit, params: &Params<f32>, config: &LossConfig) -> Self {
         let (nearest, farthest) = (config.min_depth as f32, config.max_depth as f32);
-        Predictor { model, context: Context::inference(params), nearest, farthest }
+        Predictor { model, params: Folded::new(params), nearest, farthest }
     }
 
     /// Sigmoid disparity of a picture whose sides are multiples of 32, row-major.
     pub fn disparity(&self, image: &RgbImage) -> Vec<f32> {
-        let x = Var::constant(to_tensor(&[image]));
-        self.model.disparities(&self.context, &x).swap_remove(0).value().data().to_vec()
+        self.model.predict(&self.params, &to_tensor(&[image])).swap_remove(0).data().to_vec()
     }
 
     /// Inverse depth (up to scale) of a picture: `1/max + (1/min - 1/max) disparity`.
     pub fn inverse_depth(&self, image: &RgbImage, flipped_too: bool) -> Vec<f32> {
         let (near, far) = (1.0 / self.nearest, 1.0 / self.farthest);
         let scaled = |d: Vec<f32>| -> Vec<f32> { d.into_iter().map(|d| far + (near - far) * d).collect() };
-        let plain = scaled(self.disparity(image));
         if !flipped_too {
-            return plain;
+            return scaled(self.disparity(image));
         }
         let width = image.width() as usize;
-        let mirrored = mirror(&scaled(self.disparity(&flip(image))), width);
-        flip_post_process(&plain, &mirrored, width)
+        let both = self.model.predict(&self.params, &to_tensor(&[image, &flip(image)])).swap_remove(0);
+        let (plain, mirrored) = both.data().split_at(both.len() / 2);
+        let mirrored = mirror(&scaled(mirrored.to_vec()), width);
+        flip_post_process(&scaled(plain.to_vec()), &mirrored, width)
     }
 }
 

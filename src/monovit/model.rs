@@ -4,9 +4,9 @@ use super::config::Config;
 use super::decoder::Decoder;
 use super::encoder::Encoder;
 use super::pose::{PoseDecoder, PoseEncoder};
-use crate::nn::{Builder, Context, Params};
+use crate::nn::{Builder, Context, Folded, Params};
 use crate::random::Random;
-use crate::tensor::{Float, Var};
+use crate::tensor::{Float, Tensor, Var, parallel};
 
 /// Depth encoder and decoder, pose encoder and decoder: `encoder`, `depth`, `pose_encoder`, `pose` in a checkpoint.
 #[derive(Clone, Debug)]
@@ -44,6 +44,27 @@ impl MonoVit {
     #[track_caller]
     pub fn disparities<T: Float>(&self, c: &Context<T>, image: &Var<T>) -> Vec<Var<T>> {
         self.depth.forward(c, &self.features(c, image))
+    }
+
+    /// The same as plain data, for pictures that nobody trains on: nothing is recorded, and normalisations are folded.
+    ///
+    /// Pictures run side by side, one on a thread, so that what a layer computes is still in its core's cache when the
+    /// next one reads it.
+    #[track_caller]
+    pub fn predict<T: Float>(&self, params: &Folded<T>, images: &Tensor<T>) -> Vec<Tensor<T>> {
+        let [count, h, w, channels] = images.shape().nhwc().expect("pictures");
+        let picture = |i: usize| {
+            let numbers = &images.data()[i * h * w * channels..][..h * w * channels];
+            let image = Tensor::build([1, h, w, channels], |out| out.copy_from_slice(numbers));
+            let scales = self.disparities(&Context::folded(params), &Var::constant(image));
+            scales.into_iter().map(Var::into_value).collect::<Vec<_>>()
+        };
+        let mut pictures = parallel::map(count, usize::MAX, picture);
+        if count == 1 {
+            return pictures.swap_remove(0);
+        }
+        let scales = 0..4;
+        scales.map(|s| Tensor::stack(&pictures.iter().map(|p| &p[s]).collect::<Vec<_>>())).collect()
     }
 
     /// Disparities from the encoder's maps.

@@ -165,6 +165,8 @@ impl Trainer {
         };
         let mut all = objective.backward();
         let mut gradients = c.gradients(&mut all);
+        // From here on nobody else holds the weights: they are changed in place.
+        let moved = c.into_moved();
         let bound = if self.optim.clip > 0.0 { self.optim.clip } else { f64::INFINITY };
         let grad_norm = clip_norm(&mut gradients, bound);
         if !grad_norm.is_finite() {
@@ -187,7 +189,7 @@ impl Trainer {
             };
             Group { learning_rate: learning_rates[which], decay }
         });
-        for (id, value) in c.into_moved() {
+        for (id, value) in moved {
             self.params.set(id, value);
         }
         if let Some(average) = &mut self.average {

@@ -3,14 +3,26 @@
 use std::cell::RefCell;
 use std::collections::HashMap;
 
+use super::Folded;
 use super::params::{ParamId, Params};
 use crate::random::Random;
 use crate::tensor::{Float, Gradients, Tape, Tensor, Var};
 
+/// What normalisations do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Mode {
+    /// Use and move the statistics of the batch.
+    Training,
+    /// Use the running statistics.
+    Evaluation,
+    /// Nothing: the convolutions in front of them already did.
+    Folded,
+}
+
 /// What a module needs besides its input.
 pub struct Context<T: Float> {
     vars: Vec<Var<T>>,
-    training: bool,
+    mode: Mode,
     /// Running statistics that this pass has moved; later uses in the same pass go on from here.
     moved: RefCell<HashMap<ParamId, Tensor<T>>>,
     /// The dice of DropPath.
@@ -21,16 +33,26 @@ impl<T: Float> Context<T> {
     /// Training: parameters are leaves of `tape`, normalisation uses and moves batch statistics.
     pub fn training(params: &Params<T>, tape: &Tape<T>, random: Random) -> Self {
         let var = |p: &super::Param<T>| if p.learnt { tape.leaf(p.value.clone()) } else { p.value.clone().into() };
-        Self::with(params.iter().map(|(_, p)| var(p)).collect(), true, random)
+        Self::with(params.iter().map(|(_, p)| var(p)).collect(), Mode::Training, random)
     }
 
     /// Inference: nothing is recorded, normalisation uses running statistics.
     pub fn inference(params: &Params<T>) -> Self {
-        Self::with(params.iter().map(|(_, p)| p.value.clone().into()).collect(), false, Random::new(0, 0))
+        Self::constant(params, Mode::Evaluation)
     }
 
-    fn with(vars: Vec<Var<T>>, training: bool, random: Random) -> Self {
-        Context { vars, training, moved: RefCell::default(), random: RefCell::new(random) }
+    /// Inference with normalisations folded into convolutions: what [`inference`](Context::inference) computes, but for
+    /// rounding, and faster.
+    pub fn folded(params: &Folded<T>) -> Self {
+        Self::constant(params.params(), Mode::Folded)
+    }
+
+    fn constant(params: &Params<T>, mode: Mode) -> Self {
+        Self::with(params.iter().map(|(_, p)| p.value.clone().into()).collect(), mode, Random::new(0, 0))
+    }
+
+    fn with(vars: Vec<Var<T>>, mode: Mode, random: Random) -> Self {
+        Context { vars, mode, moved: RefCell::default(), random: RefCell::new(random) }
     }
 
     /// A parameter as a variable.
@@ -40,7 +62,12 @@ impl<T: Float> Context<T> {
 
     /// Whether this is training.
     pub fn is_training(&self) -> bool {
-        self.training
+        self.mode == Mode::Training
+    }
+
+    /// Whether normalisations are folded into the convolutions in front of them.
+    pub fn is_folded(&self) -> bool {
+        self.mode == Mode::Folded
     }
 
     /// A running statistic as this pass has left it.
@@ -58,7 +85,7 @@ impl<T: Float> Context<T> {
 
     /// DropPath: zeroes the whole branch of a sample with probability `p`, and divides the kept ones by 1 - p.
     pub fn drop_path(&self, x: Var<T>, p: f64) -> Var<T> {
-        if !self.training || p == 0.0 {
+        if !self.is_training() || p == 0.0 {
             return x;
         }
         let mut dims = vec![1; x.shape().rank()];

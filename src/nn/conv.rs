@@ -1,8 +1,7 @@
 //! Convolutions as modules.
 
 use super::{BatchNorm, Builder, Context, Init, Layout, ParamId};
-use crate::ops::Conv2d;
-use crate::ops::batch_norm::Activation;
+use crate::ops::{Activation, Conv2d, DepthwiseConv2d};
 use crate::tensor::{Float, Var};
 
 /// A convolution with its weight `[k, k, in, out]` and, optionally, bias `[out]`.
@@ -48,14 +47,63 @@ impl Conv {
     pub fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
         x.conv2d(c.var(self.weight), self.bias.map(|b| c.var(b)), self.op)
     }
+
+    /// The same convolution of `x` times one gate for each channel, `[in]`: the weights take the gate, since there are
+    /// fewer of them than pixels.
+    #[track_caller]
+    pub fn forward_gated<T: Float>(&self, c: &Context<T>, x: &Var<T>, gate: &Var<T>) -> Var<T> {
+        let weight = c.var(self.weight) * gate.reshape([1, 1, gate.shape().len(), 1]);
+        x.conv2d(&weight, self.bias.map(|b| c.var(b)), self.op)
+    }
+
+    /// The same convolution with an activation behind it.
+    pub fn activated(mut self, activation: Activation) -> Self {
+        self.op = self.op.activated(activation);
+        self
+    }
+
+    /// A batch normalisation directly behind this convolution; it stands under the builder's path.
+    pub fn normalised<T: Float>(self, b: &mut Builder<T>, activation: Activation) -> Normalised<Conv> {
+        let channels = b.channels(self.weight);
+        let bn = BatchNorm::new(b, channels, activation);
+        b.normalised(self.weight, &bn);
+        Normalised { conv: self, bn }
+    }
+}
+
+/// A convolution and the batch normalisation directly behind it, which inference folds into one.
+#[derive(Clone, Debug)]
+pub struct Normalised<C> {
+    conv: C,
+    bn: BatchNorm,
+}
+
+impl Normalised<Conv> {
+    /// `[B, H, W, in] -> [B, H', W', out]`.
+    #[track_caller]
+    pub fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
+        if !c.is_folded() {
+            return self.bn.forward(c, &self.conv.forward(c, x));
+        }
+        let op = self.conv.op.activated(self.bn.activation);
+        x.conv2d(c.var(self.conv.weight), Some(c.var(self.bn.bias)), op)
+    }
+}
+
+impl Normalised<DepthwiseConv> {
+    /// `[B, H, W, C] -> [B, H / stride, W / stride, C]`.
+    #[track_caller]
+    pub fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
+        if !c.is_folded() {
+            return self.bn.forward(c, &self.conv.forward(c, x));
+        }
+        let op = DepthwiseConv2d { activation: self.bn.activation, ..self.conv.op() };
+        x.depthwise(c.var(self.conv.weight), Some(c.var(self.bn.bias)), op)
+    }
 }
 
 /// Convolution without bias, batch normalisation, activation: `conv` and `bn` in a checkpoint.
-#[derive(Clone, Debug)]
-pub struct ConvBn {
-    conv: Conv,
-    bn: BatchNorm,
-}
+pub type ConvBn = Normalised<Conv>;
 
 impl ConvBn {
     /// A `kernel` x `kernel` convolution with zero padding of half the kernel.
@@ -67,14 +115,7 @@ impl ConvBn {
         activation: Activation,
     ) -> Self {
         let op = Conv2d::padded(kernel / 2).strided(stride);
-        let conv = Conv::new(&mut b.at("conv"), channels, kernel, op, ConvStart::He);
-        ConvBn { conv, bn: BatchNorm::new(&mut b.at("bn"), channels[1], activation) }
-    }
-
-    /// `[B, H, W, in] -> [B, H / stride, W / stride, out]`.
-    #[track_caller]
-    pub fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
-        self.bn.forward(c, &self.conv.forward(c, x))
+        Conv::new(&mut b.at("conv"), channels, kernel, op, ConvStart::He).normalised(&mut b.at("bn"), activation)
     }
 }
 
@@ -105,7 +146,19 @@ impl DepthwiseConv {
     /// `[B, H, W, C] -> [B, H / stride, W / stride, C]`.
     #[track_caller]
     pub fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
-        x.depthwise_conv2d(c.var(self.weight), self.bias.map(|b| c.var(b)), self.stride, self.kernel / 2)
+        x.depthwise(c.var(self.weight), self.bias.map(|b| c.var(b)), self.op())
+    }
+
+    fn op(&self) -> DepthwiseConv2d {
+        DepthwiseConv2d { stride: self.stride, padding: self.kernel / 2, ..DepthwiseConv2d::default() }
+    }
+
+    /// A batch normalisation directly behind this convolution; it stands under the builder's path.
+    pub fn normalised<T: Float>(self, b: &mut Builder<T>, activation: Activation) -> Normalised<DepthwiseConv> {
+        let channels = b.channels(self.weight);
+        let bn = BatchNorm::new(b, channels, activation);
+        b.normalised(self.weight, &bn);
+        Normalised { conv: self, bn }
     }
 
     /// Its weight, and its bias if it has one.

@@ -6,13 +6,15 @@
 pub mod checkpoint;
 mod context;
 mod conv;
+mod fold;
 mod init;
 mod linear;
 mod norm;
 mod params;
 
 pub use context::Context;
-pub use conv::{Conv, ConvBn, ConvStart, DepthwiseConv};
+pub use conv::{Conv, ConvBn, ConvStart, DepthwiseConv, Normalised};
+pub use fold::Folded;
 pub use init::{Init, Start};
 pub use linear::Linear;
 pub use norm::{BatchNorm, LayerNorm};

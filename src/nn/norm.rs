@@ -10,11 +10,11 @@ use crate::tensor::{Float, Tensor, Var};
 /// evaluation uses the running ones.
 #[derive(Clone, Debug)]
 pub struct BatchNorm {
-    weight: ParamId,
-    bias: ParamId,
-    running_mean: ParamId,
-    running_var: ParamId,
-    activation: Activation,
+    pub(super) weight: ParamId,
+    pub(super) bias: ParamId,
+    pub(super) running_mean: ParamId,
+    pub(super) running_var: ParamId,
+    pub(super) activation: Activation,
 }
 
 impl BatchNorm {

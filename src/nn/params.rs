@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 
+use super::BatchNorm;
 use super::init::{Init, Start};
 use crate::random::Random;
 use crate::tensor::{Float, Shape, Tensor};
@@ -71,12 +72,14 @@ impl<T: Float> Param<T> {
 pub struct Params<T: Float> {
     all: Vec<Param<T>>,
     by_name: HashMap<String, ParamId>,
+    /// The convolutions with a normalisation directly behind them.
+    pub(super) normalised: Vec<(ParamId, BatchNorm)>,
 }
 
 impl<T: Float> Params<T> {
     /// No tensors.
     pub fn new() -> Self {
-        Params { all: Vec::new(), by_name: HashMap::new() }
+        Params { all: Vec::new(), by_name: HashMap::new(), normalised: Vec::new() }
     }
 
     /// Every tensor, in the order in which modules asked for them.
@@ -133,7 +136,7 @@ impl<T: Float> Params<T> {
             layout: p.layout,
             learnt: p.learnt,
         });
-        Params { all: all.collect(), by_name: self.by_name.clone() }
+        Params { all: all.collect(), by_name: self.by_name.clone(), normalised: self.normalised.clone() }
     }
 
     #[track_caller]
@@ -204,6 +207,16 @@ impl<'a, T: Float> Builder<'a, T> {
         let names = vec![self.join(name)];
         let value = Tensor::full(shape, T::of(value));
         self.params.add(Param { names, value, layout: Layout::Same, learnt: false })
+    }
+
+    /// The last dimension of a tensor.
+    pub(super) fn channels(&self, id: ParamId) -> usize {
+        self.params.get(id).value.shape().last()
+    }
+
+    /// Notes that `bn` stands directly behind the convolution with this weight, whose last dimension is the channels.
+    pub fn normalised(&mut self, weight: ParamId, bn: &BatchNorm) {
+        self.params.normalised.push((weight, bn.clone()));
     }
 
     /// One more name for a tensor that modules share.

@@ -4,32 +4,13 @@
 //! Everything is a loop over rows of C channels. So that few channels vectorise as well as many, a row is read together
 //! with its followers, up to a `width` that is a multiple of the channels, and per-channel numbers are repeated to it.
 
-use super::unary::{Function, Hardswish, Relu};
+use super::fused::{repeat, width};
+use super::unary::{Elu, Function, Hardswish, Relu};
 use super::{Case, Checked, Input, Needs, Op, ShapeError, apply, apply1};
 use crate::tensor::pool::Buffer;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
-/// What follows the normalisation in the same pass.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Activation {
-    /// Nothing.
-    #[default]
-    None,
-    /// max(x, 0).
-    Relu,
-    /// x clamp(x + 3, 0, 6) / 6.
-    Hardswish,
-}
-
-impl Activation {
-    fn name(self) -> &'static str {
-        match self {
-            Activation::None => "plain",
-            Activation::Relu => "relu",
-            Activation::Hardswish => "hardswish",
-        }
-    }
-}
+pub use super::fused::Activation;
 
 /// `y = act((x - mean) / sqrt(var + eps) * weight + bias)`, mean and (biased) variance of each channel over all rows of
 /// x [.., C] (Ioffe and Szegedy, 1502.03167). Outputs y, and as auxiliary ones the mean \[C\] and the variance \[C\].
@@ -67,25 +48,6 @@ pub struct Saved<T: Float> {
 /// Rows a tile: about 2^14 elements, which stay in the inner caches between the two passes of the statistics.
 fn tile_rows(tile: usize, c: usize) -> usize {
     if tile > 0 { tile } else { ((1 << 14) / c).max(1) }
-}
-
-/// A multiple of the channels that whole vectors divide, or at least one that is long.
-fn width(c: usize) -> usize {
-    let (mut a, mut b) = (c, 64);
-    while b != 0 {
-        (a, b) = (b, a % b);
-    }
-    let lcm = c / a * 64;
-    if lcm <= 2048 { lcm.max(128 / c * c) } else { c * 128usize.div_ceil(c) }
-}
-
-/// Rows of `width` elements, each a per-channel number repeated.
-fn repeat<T: Float, const N: usize>(width: usize, numbers: [&[T]; N]) -> [Buffer<T>; N] {
-    numbers.map(|numbers| {
-        let mut lanes = Buffer::stale(width);
-        lanes.chunks_exact_mut(numbers.len()).for_each(|l| l.copy_from_slice(numbers));
-        lanes
-    })
 }
 
 /// Sums of lanes that belong to the same channel.
@@ -147,6 +109,7 @@ fn statistics<T: Float>(x: &[T], c: usize, tile: usize) -> (Vec<f64>, Vec<f64>) 
 }
 
 /// An activation as the kernels take it.
+/// Its derivative comes from its argument, which is computed again.
 trait Fused: Copy + Send + Sync {
     fn f<T: Float>(self, x: T) -> T;
     fn df<T: Float>(self, x: T) -> T;
@@ -188,6 +151,17 @@ impl Fused for Hardswish {
     }
 }
 
+impl Fused for Elu {
+    #[inline(always)]
+    fn f<T: Float>(self, x: T) -> T {
+        Function::f(self, x)
+    }
+    #[inline(always)]
+    fn df<T: Float>(self, x: T) -> T {
+        Function::df(self, Function::f(self, x))
+    }
+}
+
 /// weight / sqrt(var + eps).
 fn scale<T: Float>(weight: &[T], rstd: &[T]) -> Vec<T> {
     weight.iter().zip(rstd).map(|(&w, &r)| w * r).collect()
@@ -202,13 +176,15 @@ fn normalise<T: Float>(s: &Saved<T>, activation: Activation, tile: usize) -> Ten
         Activation::None => normalise_with(s, Plain, tile),
         Activation::Relu => normalise_with(s, Relu, tile),
         Activation::Hardswish => normalise_with(s, Hardswish, tile),
+        Activation::Elu => normalise_with(s, Elu, tile),
     }
 }
 
 fn normalise_with<T: Float>(s: &Saved<T>, act: impl Fused, tile: usize) -> Tensor<T> {
     let c = s.x.shape().last();
     let (chunk, width) = (tile * c, width(c));
-    let [mean, scale, bias] = repeat(width, [s.mean.data(), &scale(s.weight.data(), &s.rstd), s.bias.data()]);
+    let [mean, scale, bias] =
+        [s.mean.data(), &scale(s.weight.data(), &s.rstd), s.bias.data()].map(|numbers| repeat(width, numbers));
     Tensor::build(*s.x.shape(), |out| {
         let work = 4 * out.len();
         parallel::for_each_chunk(out, chunk, work, |i, out| {
@@ -245,6 +221,7 @@ fn backward<T: Float>(
         Activation::None => backward_with(s, Plain, tile, moving, g, sink),
         Activation::Relu => backward_with(s, Relu, tile, moving, g, sink),
         Activation::Hardswish => backward_with(s, Hardswish, tile, moving, g, sink),
+        Activation::Elu => backward_with(s, Elu, tile, moving, g, sink),
     }
 }
 
@@ -261,7 +238,7 @@ fn backward_with<T: Float>(
     let (chunk, width) = (tile * c, width(c));
     let (x, g) = (s.x.data(), g.data());
     let scale = scale(s.weight.data(), &s.rstd);
-    let [mean_l, scale_l, bias_l] = repeat(width, [s.mean.data(), &scale, s.bias.data()]);
+    let [mean_l, scale_l, bias_l] = [s.mean.data(), &scale, s.bias.data()].map(|numbers| repeat(width, numbers));
     let (mut dweight, mut dbias) = (vec![0.0; c], vec![0.0; c]);
     if moving || sink.wants(1) || sink.wants(2) {
         let mut parts = Buffer::<T>::stale(rows.div_ceil(tile) * 2 * c);
@@ -306,7 +283,7 @@ fn backward_with<T: Float>(
         };
         let shift = share(&dbias, &|_| 1.0);
         let slope = share(&dweight, &|k| s.rstd[k].f64());
-        let [shift, slope] = repeat(width, [&shift[..], &slope[..]]);
+        let [shift, slope] = [&shift[..], &slope[..]].map(|numbers| repeat(width, numbers));
         let work = 6 * out.len();
         parallel::for_each_chunk(out, chunk, work, |i, out| {
             let (x, g) = (&x[i * chunk..][..out.len()], &g[i * chunk..][..out.len()]);
@@ -426,8 +403,6 @@ impl<T: Float> Op<T> for BatchNormEval {
     }
 }
 
-const ACTIVATIONS: [Activation; 3] = [Activation::None, Activation::Relu, Activation::Hardswish];
-
 /// Numbers whose normalised values, times 2 and plus 0.3, keep away from the kinks of the activations: the distances to
 /// -3, 0 and 3 are at least 0.02.
 fn spread(rows: usize, c: usize) -> Vec<f64> {
@@ -445,7 +420,7 @@ fn spread(rows: usize, c: usize) -> Vec<f64> {
 impl Checked for BatchNorm {
     fn cases() -> Vec<Case<Self>> {
         let mut cases = Vec::new();
-        for activation in ACTIVATIONS {
+        for activation in Activation::ALL {
             let op = |tile| BatchNorm { eps: 1e-3, activation, tile };
             // 1, 3, 8, 17 and 128 channels: one and several rows side by side, with and without a remainder.
             let inputs = |rows: &[usize], c: usize| {
@@ -478,7 +453,7 @@ impl Checked for BatchNorm {
 impl Checked for BatchNormEval {
     fn cases() -> Vec<Case<Self>> {
         let mut cases = Vec::new();
-        for activation in ACTIVATIONS {
+        for activation in Activation::ALL {
             let op = |tile| BatchNormEval { eps: 1e-3, activation, tile };
             let inputs = |rows: &[usize], c: usize| {
                 let shape: Vec<usize> = rows.iter().copied().chain([c]).collect();
@@ -549,14 +524,6 @@ impl<T: Float> Var<T> {
 mod tests {
     use super::*;
     use crate::random::Random;
-
-    #[test]
-    fn lanes_are_whole_rows() {
-        for c in 1..600 {
-            assert_eq!(width(c) % c, 0);
-            assert!(width(c) >= 64 && width(c) <= 2048.max(c), "{c}: {}", width(c));
-        }
-    }
 
     #[test]
     fn statistics_in_f32_keep_their_digits_far_from_zero() {

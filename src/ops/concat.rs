@@ -1,6 +1,7 @@
 //! Concatenation along one dimension.
 
 use super::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::tensor::simd::{self, copy_run};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
 /// The parts one after the other along dimension `axis`, in which alone they may differ.
@@ -51,14 +52,19 @@ impl<T: Float> Op<T> for Concat {
                 return;
             }
             parallel::for_each_chunk(out, tile * total, work, |i, out| {
-                let mut from = 0;
-                for (x, &run) in inputs.iter().zip(&runs).filter(|(_, run)| **run > 0) {
-                    let x = x.data()[i * tile * run..].chunks_exact(run);
-                    for (row, x) in out.chunks_exact_mut(total).zip(x) {
-                        row[from..from + run].copy_from_slice(x);
-                    }
-                    from += run;
-                }
+                simd::dispatch(
+                    #[inline(always)]
+                    || {
+                        let mut from = 0;
+                        for (x, &run) in inputs.iter().zip(&runs).filter(|(_, run)| **run > 0) {
+                            let x = x.data()[i * tile * run..].chunks_exact(run);
+                            for (row, x) in out.chunks_exact_mut(total).zip(x) {
+                                copy_run(&mut row[from..from + run], x);
+                            }
+                            from += run;
+                        }
+                    },
+                );
             });
         });
         (vec![y], runs)
@@ -77,13 +83,18 @@ impl<T: Float> Op<T> for Concat {
                 }
                 parallel::for_each_chunk(out, tile * run, work, |i, out| {
                     let g = g.data()[i * tile * total..].chunks_exact(total);
-                    for (d, g) in out.chunks_exact_mut(run).zip(g) {
-                        let g = &g[from..from + run];
-                        match accum {
-                            Accum::Replace => d.copy_from_slice(g),
-                            Accum::Add => d.iter_mut().zip(g).for_each(|(d, &g)| *d += g),
-                        }
-                    }
+                    simd::dispatch(
+                        #[inline(always)]
+                        || {
+                            for (d, g) in out.chunks_exact_mut(run).zip(g) {
+                                let g = &g[from..from + run];
+                                match accum {
+                                    Accum::Replace => copy_run(d, g),
+                                    Accum::Add => d.iter_mut().zip(g).for_each(|(d, &g)| *d += g),
+                                }
+                            }
+                        },
+                    );
                 });
             });
             from += run;

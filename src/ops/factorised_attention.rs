@@ -239,26 +239,32 @@ fn contexts<T: Float>(e: &Extents, qkv: &[T]) -> (Statistics<T>, Buffer<T>) {
     let mut max = Buffer::filled(e.batch * channels, -T::INFINITY);
     let mut share = Buffer::filled(e.batch * channels, T::ZERO);
     let mut context = Buffer::filled(e.batch * size, T::ZERO);
-    for b in 0..e.batch {
-        let parts = || parts.chunks_exact(2 * channels + size).skip(b * tiles).take(tiles);
-        let (max, share) = (&mut max[b * channels..][..channels], &mut share[b * channels..][..channels]);
-        let context = &mut context[b * size..][..size];
-        for part in parts() {
-            max.iter_mut().zip(part).for_each(|(m, &p)| *m = m.max(p));
-        }
-        for part in parts() {
-            let rows = context.chunks_exact_mut(heads.c).zip(part[2 * channels..].chunks_exact(heads.c));
-            for (k, (context, product)) in rows.enumerate() {
-                let factor = (part[k] - max[k]).exp();
-                share[k] = factor.mul_add(part[channels + k], share[k]);
-                context.iter_mut().zip(product).for_each(|(s, &p)| *s = factor.mul_add(p, *s));
+    // Compiled for the machine's vectors: without, every `mul_add` is a call into the C library.
+    simd::dispatch(
+        #[inline(always)]
+        || {
+            for b in 0..e.batch {
+                let parts = || parts.chunks_exact(2 * channels + size).skip(b * tiles).take(tiles);
+                let (max, share) = (&mut max[b * channels..][..channels], &mut share[b * channels..][..channels]);
+                let context = &mut context[b * size..][..size];
+                for part in parts() {
+                    max.iter_mut().zip(part).for_each(|(m, &p)| *m = m.max(p));
+                }
+                for part in parts() {
+                    let rows = context.chunks_exact_mut(heads.c).zip(part[2 * channels..].chunks_exact(heads.c));
+                    for (k, (context, product)) in rows.enumerate() {
+                        let factor = (part[k] - max[k]).exp();
+                        share[k] = factor.mul_add(part[channels + k], share[k]);
+                        context.iter_mut().zip(product).for_each(|(s, &p)| *s = factor.mul_add(p, *s));
+                    }
+                }
+                for (share, context) in share.iter_mut().zip(context.chunks_exact_mut(heads.c)) {
+                    *share = T::ONE / *share;
+                    context.iter_mut().for_each(|s| *s *= *share);
+                }
             }
-        }
-        for (share, context) in share.iter_mut().zip(context.chunks_exact_mut(heads.c)) {
-            *share = T::ONE / *share;
-            context.iter_mut().for_each(|s| *s *= *share);
-        }
-    }
+        },
+    );
     (Statistics { max, share }, context)
 }
 

@@ -1,5 +1,6 @@
 //! The linear layer: one GEMM over all the rows of the batch.
 
+use super::fused::{Activation, Finish};
 use super::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::gemm::{Rows, RowsMut, gemm};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
@@ -16,20 +17,16 @@ fn tile_rows(tile: usize, k: usize, n: usize) -> usize {
     if tile > 0 { tile } else { ((1 << 17) / (k * n).max(1)).clamp(32, 1024) }
 }
 
-/// `out = x w (+ b)`.
-pub(crate) fn forward<T: Float>(out: &mut [T], x: Rows<T>, w: &[T], b: Option<&[T]>, tile: usize) {
+/// `out = x w`, finished.
+pub(super) fn forward<T: Float>(out: &mut [T], x: Rows<T>, w: &[T], finish: &Finish<T>, tile: usize) {
     let k = x.cols;
     let n = out.len() / x.rows.max(1);
     let tile = tile_rows(tile, k, n);
     let work = 2 * out.len() * k;
     parallel::for_each_chunk(out, tile * n, work, |i, out| {
         let rows = out.len() / n;
-        let mut accum = Accum::Replace;
-        if let Some(b) = b {
-            out.chunks_exact_mut(n).for_each(|row| row.copy_from_slice(b));
-            accum = Accum::Add;
-        }
-        gemm(RowsMut::dense(out, rows, n), accum, x.rows(i * tile, rows), Rows::dense(w, k, n), T::ONE);
+        gemm(RowsMut::dense(out, rows, n), Accum::Replace, x.rows(i * tile, rows), Rows::dense(w, k, n), T::ONE);
+        finish.run(out);
     });
 }
 
@@ -77,7 +74,8 @@ impl<T: Float> Op<T> for Linear {
         let (x, w, b) = (inputs[0], inputs[1], inputs.get(2));
         let shape = x.shape().with(x.shape().rank() - 1, w.dims()[1]);
         let rows = Rows::dense(x.data(), x.shape().rows(), w.dims()[0]);
-        let y = Tensor::build(shape, |out| forward(out, rows, w.data(), b.map(|b| b.data()), self.tile));
+        let finish = Finish::new(b.map(|b| b.data()), Activation::None);
+        let y = Tensor::build(shape, |out| forward(out, rows, w.data(), &finish, self.tile));
         (vec![y], (needs.get(1).then(|| x.clone()), needs.get(0).then(|| w.clone())))
     }
 

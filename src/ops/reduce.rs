@@ -1,7 +1,8 @@
 //! Sums, means and extremes along dimensions.
 
 use super::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply, apply1};
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
+use crate::tensor::pool::Buffer;
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
 /// The sum over a run of dimensions `first..first + count`, times a factor (one over their size makes a mean).
 /// The dimensions are dropped.
@@ -56,10 +57,8 @@ impl<T: Float> Op<T> for Sum {
             if n == 0 {
                 return out.fill(T::ZERO * factor);
             }
-            for (out, x) in out.chunks_mut(inner.max(1)).zip(x.data().chunks(n * inner.max(1))) {
-                sum_rows(out, x);
-                out.iter_mut().for_each(|y| *y *= factor);
-            }
+            sum_each(out, x.data(), n, inner);
+            out.iter_mut().for_each(|y| *y *= factor);
         });
         (vec![y], *x.shape())
     }
@@ -73,16 +72,48 @@ impl<T: Float> Op<T> for Sum {
             if out.is_empty() {
                 return;
             }
-            for (out, g) in out.chunks_mut(n * inner).zip(g.data().chunks(inner)) {
-                for out in out.chunks_mut(inner) {
-                    let terms = out.iter_mut().zip(g);
-                    match accum {
-                        Accum::Replace => terms.for_each(|(d, &g)| *d = g * factor),
-                        Accum::Add => terms.for_each(|(d, &g)| *d += g * factor),
-                    }
-                }
-            }
+            let (work, tile) = (2 * out.len(), (CHUNK / inner).max(1));
+            let pieces = out.chunks_mut(n * inner).zip(g.data().chunks(inner));
+            let pieces = pieces.flat_map(|(out, g)| out.chunks_mut(tile * inner).map(move |out| (out, g)));
+            parallel::for_each_piece(pieces, work, |(out, g)| {
+                simd::dispatch(
+                    #[inline(always)]
+                    || {
+                        for out in out.chunks_mut(inner) {
+                            let terms = out.iter_mut().zip(g);
+                            match accum {
+                                Accum::Replace => terms.for_each(|(d, &g)| *d = g * factor),
+                                Accum::Add => terms.for_each(|(d, &g)| *d += g * factor),
+                            }
+                        }
+                    },
+                );
+            });
         });
+    }
+}
+
+/// Elements handed to a thread at a time, about.
+const CHUNK: usize = 1 << 14;
+/// Rows of one sum that are worth a thread of their own.
+const LONG: usize = 1 << 10;
+/// Partial sums of long ones: a number that does not depend on the threads.
+const PARTS: usize = 8;
+
+/// The sum of every `n` rows of `inner` numbers.
+fn sum_each<T: Float>(out: &mut [T], x: &[T], n: usize, inner: usize) {
+    let (inner, work) = (inner.max(1), x.len());
+    if n < LONG {
+        return parallel::for_each_chunk(out, inner, work, |i, out| sum_rows(out, &x[i * n * inner..][..n * inner]));
+    }
+    let step = n.div_ceil(PARTS);
+    let mut parts = Buffer::stale(out.len() * PARTS);
+    parallel::for_each_chunk(&mut parts, inner, work, |i, part| {
+        let (from, to) = ((i % PARTS * step).min(n), ((i % PARTS + 1) * step).min(n));
+        sum_rows(part, &x[(i / PARTS * n + from) * inner..(i / PARTS * n + to) * inner]);
+    });
+    for (out, parts) in out.chunks_mut(inner).zip(parts.chunks(PARTS * inner)) {
+        sum_rows(out, parts);
     }
 }
 
@@ -106,6 +137,14 @@ pub(crate) fn pairwise_sum<T: Float>(x: &[T]) -> T {
 
 /// The sum of the rows of a matrix, in blocks that are then summed in pairs.
 pub(super) fn sum_rows<T: Float>(out: &mut [T], x: &[T]) {
+    simd::dispatch(
+        #[inline(always)]
+        || sum_rows_here(out, x),
+    );
+}
+
+#[inline(always)]
+fn sum_rows_here<T: Float>(out: &mut [T], x: &[T]) {
     const BLOCK: usize = 64;
     if let [sum] = out {
         *sum = pairwise_sum(x);
@@ -140,6 +179,8 @@ impl Checked for Sum {
                 Case::new("nothing", sum(1, 0), [x()]),
                 Case::new("many rows", sum(0, 1), [Input::random("x", [150, 2])]),
                 Case::new("a long run", sum(0, 1), [Input::random("x", [600])]),
+                Case::new("a run in parts", sum(1, 1), [Input::random("x", [2, 1030])]),
+                Case::new("rows in parts", sum(0, 1), [Input::random("x", [1026, 2])]),
                 Case::new("empty rest", sum(0, 1), [Input::random("x", [3, 0])]).flat(),
             ]);
         }

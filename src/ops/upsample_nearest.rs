@@ -1,6 +1,7 @@
 //! Nearest-neighbour enlargement by a whole factor.
 
 use super::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::tensor::simd::copy_run;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
 /// Every pixel of [batch, height, width, channels] becomes a square of `scale` x `scale` pixels.
@@ -42,9 +43,14 @@ impl<T: Float> Op<T> for UpsampleNearest {
             parallel::for_each_chunk(out, s * row, work, |i, out| {
                 let (first, copies) = out.split_at_mut(row);
                 let x = &x.data()[i * w * c..][..w * c];
-                for (square, x) in first.chunks_exact_mut(s * c).zip(x.chunks_exact(c)) {
-                    square.chunks_exact_mut(c).for_each(|y| y.copy_from_slice(x));
-                }
+                simd::dispatch(
+                    #[inline(always)]
+                    || {
+                        for (square, x) in first.chunks_exact_mut(s * c).zip(x.chunks_exact(c)) {
+                            square.chunks_exact_mut(c).for_each(|y| copy_run(y, x));
+                        }
+                    },
+                );
                 copies.chunks_exact_mut(row).for_each(|copy| copy.copy_from_slice(first));
             });
         });

@@ -1,7 +1,10 @@
 //! An exponential moving average of the weights: smoother than the last step, and often better.
 
 use crate::nn::Params;
-use crate::tensor::{Float, Tensor};
+use crate::tensor::{Float, Tensor, parallel, simd};
+
+/// Elements handed to a thread at a time.
+const CHUNK: usize = 1 << 14;
 
 /// The average of every tensor of a model (running statistics too), with a decay that warms up with the step:
 /// min(decay, (1 + t) / (10 + t)).
@@ -24,7 +27,14 @@ impl<T: Float> Average<T> {
         let decay = self.decay.min((1.0 + t as f64) / (10.0 + t as f64));
         let take = T::of(1.0 - decay);
         for (average, (_, p)) in self.values.iter_mut().zip(params.iter()) {
-            average.data_mut().iter_mut().zip(p.value.data()).for_each(|(a, &w)| *a += take * (w - *a));
+            let weights = p.value.data();
+            parallel::for_each_chunk(average.data_mut(), CHUNK, 2 * weights.len(), |i, average| {
+                let weights = &weights[i * CHUNK..][..average.len()];
+                simd::dispatch(
+                    #[inline(always)]
+                    || average.iter_mut().zip(weights).for_each(|(a, &w)| *a += take * (w - *a)),
+                );
+            });
         }
     }
 

@@ -1,10 +1,33 @@
 //! The norm of all gradients together, and a bound on it.
 
-use crate::tensor::{Float, Tensor};
+use crate::tensor::{Float, Tensor, parallel, simd};
+
+/// Elements handed to a thread at a time.
+const CHUNK: usize = 1 << 14;
+
+/// In f64, sixteen sums side by side.
+fn sum_of_squares<T: Float>(x: &[T]) -> f64 {
+    let (blocks, rest) = x.as_chunks::<16>();
+    let mut result = [0.0; 16];
+    simd::dispatch(
+        #[inline(always)]
+        || {
+            let mut sums = result;
+            for block in blocks {
+                sums.iter_mut().zip(block).for_each(|(s, x)| *s += x.f64() * x.f64());
+            }
+            result = sums;
+        },
+    );
+    result.iter().sum::<f64>() + rest.iter().map(|x| x.f64() * x.f64()).sum::<f64>()
+}
 
 /// The Euclidean norm of all gradients as one vector.
 pub fn norm<T: Float>(gradients: &[Option<Tensor<T>>]) -> f64 {
-    let squares = |g: &Tensor<T>| g.data().iter().map(|&x| x.f64() * x.f64()).sum::<f64>();
+    let squares = |g: &Tensor<T>| {
+        let chunk = |i: usize| sum_of_squares(&g.data()[i * CHUNK..((i + 1) * CHUNK).min(g.len())]);
+        parallel::map(g.len().div_ceil(CHUNK), 2 * g.len(), chunk).into_iter().sum::<f64>()
+    };
     gradients.iter().flatten().map(squares).sum::<f64>().sqrt()
 }
 
@@ -14,7 +37,9 @@ pub fn clip_norm<T: Float>(gradients: &mut [Option<Tensor<T>>], bound: f64) -> f
     if before > bound {
         let factor = T::of(bound / before);
         for g in gradients.iter_mut().flatten() {
-            g.data_mut().iter_mut().for_each(|x| *x *= factor);
+            let g = g.data_mut();
+            let work = g.len();
+            parallel::for_each_chunk(g, CHUNK, work, |_, g| g.iter_mut().for_each(|x| *x *= factor));
         }
     }
     before

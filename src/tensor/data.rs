@@ -50,6 +50,20 @@ impl<T: Float> Tensor<T> {
         Tensor { shape, buffer: Arc::new(buffer) }
     }
 
+    /// Tensors of one shape `[n, ..]` one after the other, along the first dimension.
+    ///
+    /// # Panics
+    /// If there is none, if one is a scalar, or if their shapes differ.
+    #[track_caller]
+    pub fn stack(parts: &[&Self]) -> Self {
+        let shape = *parts[0].shape();
+        assert!(parts.iter().all(|p| *p.shape() == shape), "stacked tensors have one shape");
+        Self::build(shape.with(0, parts.len() * shape.dims()[0]), |out| {
+            let outs = out.chunks_exact_mut(shape.len().max(1));
+            outs.zip(parts).for_each(|(out, part)| out.copy_from_slice(part.data()));
+        })
+    }
+
     /// All elements `value`.
     pub fn full(shape: impl Into<Shape>, value: T) -> Self {
         let shape = shape.into();

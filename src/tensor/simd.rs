@@ -18,6 +18,15 @@ pub fn dispatch<R>(kernel: impl FnOnce() -> R) -> R {
     ARCH.dispatch(kernel)
 }
 
+/// Copies a run, in whole vectors as far as they go: some runs are too short for a call to `memcpy`. To be called inside
+/// [`dispatch`].
+#[inline(always)]
+pub(crate) fn copy_run<T: Copy>(to: &mut [T], from: &[T]) {
+    let ((to, to_rest), (from, from_rest)) = (to.as_chunks_mut::<8>(), from.as_chunks::<8>());
+    to.iter_mut().zip(from).for_each(|(t, f)| *t = *f);
+    to_rest.iter_mut().zip(from_rest).for_each(|(t, f)| *t = *f);
+}
+
 /// Element types of which there are vectors, for the few kernels that keep vectors in registers across loops of their
 /// own, which the compiler does not find by itself. Run one with [`dispatch_vector`].
 pub trait Vector: Copy + 'static {

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use parallax::monovit::loss::{Loss, LossConfig, Views, loss};
 use parallax::monovit::{MonoVit, Preset};
-use parallax::nn::{Context, Params, checkpoint};
+use parallax::nn::{Context, Folded, Params, checkpoint};
 use parallax::optim::{AdamW, Group};
 use parallax::random::Random;
 use parallax::tensor::{Float, Tape, Tensor, Var};
@@ -172,5 +172,10 @@ fn three_steps_and_evaluation_in_f64() {
     for (s, disparity) in pico.model.disparities(&c, &target).iter().enumerate() {
         let expected = pico.reference.map(&format!("eval_after3/disp/{s}"));
         assert_error(disparity.value(), &expected, 1e-9, &format!("disparity {s}"));
+    }
+    let folded = pico.model.predict(&Folded::new(&pico.params), target.value());
+    for (s, disparity) in folded.iter().enumerate() {
+        let expected = pico.reference.map(&format!("eval_after3/disp/{s}"));
+        assert_error(disparity, &expected, 1e-9, &format!("disparity {s}, normalisations folded"));
     }
 }

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use parallax::monovit::{MonoVit, Preset};
-use parallax::nn::{Context, Params, checkpoint};
+use parallax::nn::{Context, Folded, Params, checkpoint};
 use parallax::tensor::{Shape, Tensor, Var};
 
 fn fixture(name: &str) -> PathBuf {
@@ -91,6 +91,17 @@ fn check(preset: Preset) {
         let e = error(disparity.value(), &expected);
         assert!(e <= 1e-9, "{size}: disparity {s}: error {e:.1e}");
     }
+    let folded = Folded::new(&params);
+    for (s, disparity) in model.predict(&folded, input("input").value()).iter().enumerate() {
+        let expected = reference[&format!("{size}/disp/{s}")].permute(&[0, 2, 3, 1]);
+        let e = error(disparity, &expected);
+        assert!(e <= 1e-9, "{size}: disparity {s}, normalisations folded: error {e:.1e}");
+    }
+    let c = Context::folded(&folded);
+    let motion = model.motion(&c, &input("input"), &input("input2"));
+    let e = error(motion.value(), &reference[&format!("{size}/pose")]);
+    assert!(e <= 1e-9, "{size}: pose, normalisations folded: error {e:.1e}");
+    let c = Context::inference(&params);
     let motion = model.motion(&c, &input("input"), &input("input2"));
     let e = error(motion.value(), &reference[&format!("{size}/pose")]);
     assert!(e <= 1e-9, "{size}: pose: error {e:.1e}");

@@ -48,14 +48,16 @@ impl Pose {
 
 /// How far a car may travel in one frame, in metres.
 pub(crate) const FASTEST: f64 = 1.0;
-/// How far the camera strays from the middle of its lane, in metres, before the driver corrects in earnest.
-const LANE: f64 = 1.0;
+/// The camera's car wanders less the less room there is, but never drives as on rails; at most this far, in metres.
+const STRAYING: std::ops::Range<f64> = 0.25..1.0;
 
 /// The path of a car for `frames` frames: 0.5 to 1 m a frame with slow changes of speed, gentle steering that holds the
-/// lane (its middle at x = `lane`), and a little pitch. With `keep_right` it stays off the oncoming traffic.
-pub(crate) fn drive(draw: &mut Draw, frames: usize, lane: f64, keep_right: bool) -> Vec<Pose> {
-    let mut x = lane + if keep_right { draw.range(0.2, 0.8) } else { draw.range(-0.8, 0.8) };
-    let goal = lane + if keep_right { 0.4 } else { draw.range(-0.3, 0.3) };
+/// lane (its middle at x = `lane`, with `room` metres to stray on either side), and a little pitch. With `keep_right` it
+/// stays off the oncoming traffic.
+pub(crate) fn drive(draw: &mut Draw, frames: usize, lane: f64, room: f64, keep_right: bool) -> Vec<Pose> {
+    let room = room.clamp(STRAYING.start, STRAYING.end);
+    let mut x = lane + room * if keep_right { draw.range(0.2, 0.8) } else { draw.range(-0.8, 0.8) };
+    let goal = lane + room * if keep_right { 0.4 } else { draw.range(-0.3, 0.3) };
     let mut z = 0.0;
     let mut yaw = draw.range(-0.03, 0.03);
     let (mut turn, mut surge) = (0.0, 0.0);
@@ -63,7 +65,7 @@ pub(crate) fn drive(draw: &mut Draw, frames: usize, lane: f64, keep_right: bool)
     let mut poses = Vec::with_capacity(frames);
     for _ in 0..frames {
         // The yaw rate forgets, and is drawn back to the street's direction and to the lane.
-        let strayed = (x - goal) - (x - goal).clamp(-LANE, LANE);
+        let strayed = (x - goal) - (x - goal).clamp(-room, room);
         turn = 0.8 * turn + draw.normal(0.004) - 0.02 * yaw - 0.002 * (x - goal) - 0.03 * strayed;
         yaw = (yaw + turn).clamp(-0.12, 0.12);
         let pose = Pose::new([x, 0.0, z], yaw, draw.normal(0.002));
@@ -109,7 +111,7 @@ mod tests {
     #[test]
     fn poses_are_rotations_and_the_car_stays_in_its_lane() {
         for seed in 0..20 {
-            let path = drive(&mut Draw::new(seed, 0, 0), 500, 0.0, seed % 2 == 0);
+            let path = drive(&mut Draw::new(seed, 0, 0), 500, 0.0, 1.0, seed % 2 == 0);
             for pair in path.windows(2) {
                 let (a, b) = (pair[0], pair[1]);
                 let step = ((b.position[0] - a.position[0]).powi(2) + (b.position[2] - a.position[2]).powi(2)).sqrt();

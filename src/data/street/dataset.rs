@@ -73,8 +73,8 @@ impl Street {
         let done = AtomicUsize::new(0);
         let sequence = |k: usize| {
             let world = World::new(&mut Draw::new(config.seed, k as u64, WORLD), config.frames, config.moving_cars);
-            let poses =
-                drive(&mut Draw::new(config.seed, k as u64, PATH), config.frames, world.lane, config.moving_cars);
+            let draw = &mut Draw::new(config.seed, k as u64, PATH);
+            let poses = drive(draw, config.frames, world.lane, world.room, config.moving_cars);
             let image = |(frame, pose): (usize, &Pose)| {
                 let image = Scene::new(&world, View::new(config, *pose), frame).image();
                 let done = done.fetch_add(1, Ordering::Relaxed) + 1;

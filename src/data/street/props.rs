@@ -21,11 +21,19 @@ const PAINTS: [[f64; 3]; 10] = [
     [0.62, 0.55, 0.42],
 ];
 
+/// Half the width of the widest car, in metres.
+pub(crate) const HALF_CAR: f64 = 0.92;
+
+/// How near to the middle of a road, `half` of which lies between it and the kerb, the middle of a parked car stands.
+pub(crate) fn nearest_parked(half: f64) -> f64 {
+    (half - 2.3).max(2.75)
+}
+
 /// The cars parked along one side.
 pub(crate) fn parked(world: &mut World, draw: &mut Draw, style: &Style, side: f64, traffic: bool) {
     let mut z = style.begin + draw.range(0.0, 10.0);
     // Oncoming traffic needs the room.
-    let nearest = if traffic && side < 0.0 { 4.0 } else { (style.half - 2.3).max(2.75) };
+    let nearest = if traffic && side < 0.0 { 4.0 } else { nearest_parked(style.half) };
     let furthest = (style.half - 1.1).max(nearest + 0.2);
     while z < style.end - 10.0 {
         let x = side * draw.range(nearest, furthest);
@@ -54,7 +62,7 @@ fn car(world: &mut World, draw: &mut Draw, x: f64, z: f64, away: bool, speed: f6
     let van = draw.chance(0.2);
     let length = if van { draw.range(4.6, 6.0) } else { draw.range(3.6, 4.8) };
     let height = if van { draw.range(1.9, 2.4) } else { draw.range(1.4, 1.65) };
-    let half = 0.5 * draw.range(1.68, 1.84);
+    let half = 0.5 * draw.range(1.68, 2.0 * HALF_CAR);
     let first = world.solids.len();
     let up = |h: f64| GROUND_Y - h;
     let middle = z + 0.5 * length;

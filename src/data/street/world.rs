@@ -27,6 +27,8 @@ pub(crate) type Footprint = [f64; 4];
 pub(crate) struct World {
     /// The middle of the lane that the camera's car keeps to, in metres from the middle of the road.
     pub(crate) lane: f64,
+    /// How far the camera may stray from there, in metres.
+    pub(crate) room: f64,
     pub(crate) light: Light,
     pub(crate) solids: Vec<Solid>,
     /// The footprints of what is parked, by metres from -[`BEHIND`], left and right: at most two reach into a metre.
@@ -82,7 +84,8 @@ impl World {
         };
         let light = Light::new(draw, setback.map(|back| half + 2.2 + back));
         let lane = draw.range(-0.6, 0.6) * (half - 5.5).max(0.0);
-        let mut world = World { lane, light, solids: Vec::new(), shade: [Vec::new(), Vec::new()], movers: Vec::new() };
+        let room = props::nearest_parked(half) - props::HALF_CAR - CLEARANCE - lane.abs();
+        let mut world = World { lane, room, light, solids: Vec::new(), shade: [Vec::new(), Vec::new()], movers: Vec::new() };
         world.ground(draw, &style);
         for side in [-1.0, 1.0] {
             houses::row(&mut world, draw, &style, side);
@@ -178,6 +181,8 @@ impl World {
     }
 }
 
+/// From a parked car's side to the camera: half a car of its own, and what a careful driver leaves.
+const CLEARANCE: f64 = 1.45;
 /// From bumper to bumper, to hardly a car.
 const CAR_GAPS: [f64; 6] = [4.0, 7.0, 12.0, 14.0, 20.0, 60.0];
 /// Leaves and paving, before they vary.
@@ -198,4 +203,27 @@ fn under(footprint: Footprint, p: [f32; 3]) -> f32 {
 /// The x range of something between `near` and `far` of the middle, on a side.
 pub(crate) fn across(side: f64, near: f64, far: f64) -> (f64, f64) {
     if side > 0.0 { (near, far) } else { (-far, -near) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::camera::drive;
+    use super::props::HALF_CAR;
+    use super::*;
+
+    /// The camera looks out of a car that is as wide as others.
+    #[test]
+    fn the_camera_scrapes_no_parked_car() {
+        for seed in 0..300 {
+            let world = World::new(&mut Draw::new(seed, 0, 1), 10, false);
+            for pose in drive(&mut Draw::new(seed, 0, 2), 10, world.lane, world.room, false) {
+                for [x0, x1, z0, z1] in world.shade.iter().flatten().flatten().flatten() {
+                    if (z0 - 2.0..z1 + 2.0).contains(&pose.position[2]) {
+                        let clear = (x0 - pose.position[0]).max(pose.position[0] - x1);
+                        assert!(clear > HALF_CAR + 0.1, "seed {seed}: {clear:.2} m from the camera to a car's side");
+                    }
+                }
+            }
+        }
+    }
 }

@@ -114,6 +114,45 @@ impl Geometry {
         fitting.clamp(1, self.rows().div_ceil(4).max(1))
     }
 
+    /// How many neighbouring outputs of a row are best computed as one pixel with as many times the channels; 1 if each
+    /// by itself.
+    ///
+    /// A product fills vector registers along the output's channels. Where these are few, `s` pixels side by side fill
+    /// them better: they share a window that is `s - 1` strides wider, whose weights are zero where a pixel does not
+    /// look. That is more arithmetic, but at the full width of the registers, and less of the im2col matrix, since
+    /// neighbouring windows overlap.
+    pub(in crate::ops) fn side_by_side(&self) -> usize {
+        if self.groups > 1 || self.dilation[1] != 1 || self.kernel[1] == 1 {
+            return 1;
+        }
+        let fits = [1, 2, 4, 8, 16].into_iter().filter(|s| self.out[1].is_multiple_of(*s) && self.out[1] > 0);
+        let costs = fits.map(|s| (self.cost(s), s));
+        costs.min_by(|a, b| a.0.total_cmp(&b.0)).map_or(1, |(_, s)| s)
+    }
+
+    /// What an output pixel costs, for each row and channel of the window, with `s` side by side: the product, and the
+    /// copies of im2col.
+    fn cost(&self, s: usize) -> f64 {
+        let window = (self.kernel[1] + (s - 1) * self.stride[1]) as f64;
+        let lanes = s * self.out_channels;
+        // Registers of 16 numbers; with one alone, additions wait for each other half of the time.
+        let registers = lanes.div_ceil(16);
+        let waiting = if registers == 1 { 2.0 } else { 1.0 };
+        // 32 multiply-adds, or 6 copied numbers, in a clock cycle.
+        window * (waiting * (registers * 16) as f64 / s as f64 / 32.0 + 1.0 / s as f64 / 6.0)
+    }
+
+    /// The same convolution with `s` outputs of a row as one pixel.
+    pub(super) fn widened(&self, s: usize) -> Geometry {
+        Geometry {
+            out: [self.out[0], self.out[1] / s],
+            out_channels: s * self.out_channels,
+            kernel: [self.kernel[0], self.kernel[1] + (s - 1) * self.stride[1]],
+            stride: [self.stride[0], s * self.stride[1]],
+            ..*self
+        }
+    }
+
     /// The convolution of dy that gives dx, if it is one: stride 1, and a window that reaches beyond the padding.
     pub(in crate::ops) fn transposed(&self) -> Option<Geometry> {
         let mut padding = [0; 2];

@@ -1,18 +1,12 @@
 //! The three products of a convolution, tile by tile: outputs, the gradient of the input, the gradient of the weights.
 
 use super::geometry::Geometry;
+use crate::ops::fused::Finish;
 use crate::ops::linear::sum_into;
 use crate::tensor::gemm::{Rows, RowsMut, gemm};
 use crate::tensor::pool::Buffer;
+use crate::tensor::simd::copy_run;
 use crate::tensor::{Accum, Float, Tensor, parallel, simd};
-
-/// Copies a run, in whole vectors as far as they go: runs are too short for a call to `memcpy`.
-#[inline(always)]
-fn copy_run<T: Copy>(to: &mut [T], from: &[T]) {
-    let ((to, to_rest), (from, from_rest)) = (to.as_chunks_mut::<8>(), from.as_chunks::<8>());
-    to.iter_mut().zip(from).for_each(|(t, f)| *t = *f);
-    to_rest.iter_mut().zip(from_rest).for_each(|(t, f)| *t = *f);
-}
 
 /// Fills the im2col rows of the output pixels of row `oy`, for one group: `[out width, patch]`.
 fn im2col<T: Float>(g: &Geometry, image: &[T], oy: usize, group: usize, patches: &mut [T]) {
@@ -57,29 +51,47 @@ fn im2col_tile<T: Float>(g: &Geometry, x: &[T], first: usize, rows: usize, group
     }
 }
 
-/// `out = conv(x, w) + bias`, or added to what is there.
+/// `out = conv(x, w)`, or added to what is there; and finished.
 pub(in crate::ops) fn convolve<T: Float>(
     out: &mut [T],
     accum: Accum,
     g: &Geometry,
     x: &[T],
     w: &[T],
-    bias: Option<&[T]>,
+    finish: &Finish<T>,
 ) {
+    let side_by_side = g.side_by_side();
+    if side_by_side > 1 {
+        let wide = g.widened(side_by_side);
+        return product(out, accum, &wide, x, &widened(g, side_by_side, w), finish);
+    }
+    product(out, accum, g, x, w, finish);
+}
+
+/// The weights of `s` outputs side by side, `[kh, kw + (s - 1) stride, in, s out]`: each output's own, as many strides
+/// along as it stands, and zeros around.
+fn widened<T: Float>(g: &Geometry, s: usize, w: &[T]) -> Buffer<T> {
+    let (c, n, kw) = (g.channels, g.out_channels, g.kernel[1]);
+    let wide = g.widened(s).kernel[1];
+    let mut out = Buffer::filled(g.kernel[0] * wide * c * s * n, T::ZERO);
+    let rows = w.chunks_exact((kw * c * n).max(1)).zip(out.chunks_exact_mut((wide * c * s * n).max(1)));
+    for (row, out) in rows {
+        for (i, w) in row.chunks_exact(n).enumerate() {
+            let (kx, channel) = (i / c, i % c);
+            for j in 0..s {
+                out[(((kx + j * g.stride[1]) * c + channel) * s + j) * n..][..n].copy_from_slice(w);
+            }
+        }
+    }
+    out
+}
+
+/// im2col and products, tile by tile.
+fn product<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: &[T], w: &[T], finish: &Finish<T>) {
     let (n, patch, width, tile) = (g.out_channels, g.patch(), g.out[1], g.tile());
     let work = 2 * g.rows() * width * patch * n;
     parallel::for_each_chunk(out, tile * width * n, work, |i, out| {
         let rows = out.len() / (width * n);
-        let mut accum = accum;
-        if let Some(bias) = bias {
-            for pixel in out.chunks_exact_mut(n) {
-                match accum {
-                    Accum::Replace => pixel.copy_from_slice(bias),
-                    Accum::Add => pixel.iter_mut().zip(bias).for_each(|(y, &b)| *y += b),
-                }
-            }
-            accum = Accum::Add;
-        }
         let pixels = rows * width;
         let mut patches = Buffer::stale(pixels * patch);
         for group in 0..g.groups {
@@ -94,6 +106,7 @@ pub(in crate::ops) fn convolve<T: Float>(
                 T::ONE,
             );
         }
+        finish.run(out);
     });
 }
 
@@ -117,7 +130,7 @@ pub(in crate::ops) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, g: &
     match g.transposed() {
         Some(t) => {
             let turned = turned(g, w);
-            convolve(out, accum, &t, dy, &turned, None);
+            convolve(out, accum, &t, dy, &turned, &Finish::nothing());
             if g.reflect {
                 mirrored_border(out, g, &t, dy, &turned);
             }
@@ -225,6 +238,8 @@ pub(in crate::ops) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, g: 
     let (n, ng, patch, width, tile) = (g.out_channels, g.group_out(), g.patch(), g.out[1], g.tile());
     let tiles = g.rows().div_ceil(tile);
     let parts = tiles.clamp(1, PARTS);
+    // A product fills registers along the rows of its result: those had better be long.
+    let transposed = g.groups == 1 && n < 64 && n < patch;
     let partial = |part: usize, sum: &mut [T], mut accum: Accum| {
         let mine = part * tiles / parts..(part + 1) * tiles / parts;
         if mine.is_empty() && accum == Accum::Replace {
@@ -238,17 +253,31 @@ pub(in crate::ops) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, g: 
                 let patches = &mut patches[..pixels * patch];
                 im2col_tile(g, x, first, rows, group, patches);
                 let dy = Rows::columns(&dy[first * width * n..][..pixels * n], pixels, n, group * ng, ng);
-                let patches = Rows::dense(patches, pixels, patch).t();
-                gemm(RowsMut::columns(sum, patch, n, group * ng, ng), accum, patches, dy, T::ONE);
+                let patches = Rows::dense(patches, pixels, patch);
+                if transposed {
+                    gemm(RowsMut::dense(sum, n, patch), accum, dy.t(), patches, T::ONE);
+                } else {
+                    gemm(RowsMut::columns(sum, patch, n, group * ng, ng), accum, patches.t(), dy, T::ONE);
+                }
             }
             accum = Accum::Add;
         }
     };
-    if parts == 1 {
+    if parts == 1 && !transposed {
         return partial(0, out, accum);
     }
     let work = 2 * g.rows() * width * patch * n;
-    let sums = parallel::map(parts, work, |part| Tensor::build([patch, n], |sum| partial(part, sum, Accum::Replace)));
+    let sums = parallel::map(parts, work, |part| Tensor::build([patch * n], |sum| partial(part, sum, Accum::Replace)));
+    if transposed {
+        let mut sum = Buffer::stale(patch * n);
+        sum_into(&mut sum, Accum::Replace, &sums);
+        for (k, row) in out.chunks_exact_mut(n).enumerate() {
+            for (o, s) in row.iter_mut().zip(sum[k..].iter().step_by(patch)) {
+                *o = if accum == Accum::Add { *o + *s } else { *s };
+            }
+        }
+        return;
+    }
     sum_into(out, accum, &sums);
 }
 

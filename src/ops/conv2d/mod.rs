@@ -7,16 +7,17 @@
 pub(super) mod geometry;
 pub(super) mod kernel;
 
+use super::fused::{Activation, Finish};
 use super::linear;
 use super::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::gemm::Rows;
-use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 use geometry::Geometry;
 
 /// `x [batch, height, width, in]`, `w [kh, kw, in / groups, out]`, optionally `b [out]`
 /// -> `[batch, (height + 2 padding - dilation (kh - 1) - 1) / stride + 1, ..., out]`.
 ///
-/// A cross-correlation, as everywhere in deep learning. Depthwise convolution has an op of its own.
+/// A cross-correlation, as everywhere in deep learning, and an activation if one is set. Depthwise convolution has an op of its own.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Conv2d {
     /// Stride, (height, width).
@@ -31,11 +32,21 @@ pub struct Conv2d {
     pub reflect: bool,
     /// Output rows handed to a thread at a time; chosen by shape if 0. A gradient check shrinks it.
     pub tile: usize,
+    /// What follows, applied to a tile while it is in the cache.
+    pub activation: Activation,
 }
 
 impl Default for Conv2d {
     fn default() -> Self {
-        Conv2d { stride: [1; 2], padding: [0; 2], dilation: [1; 2], groups: 1, reflect: false, tile: 0 }
+        Conv2d {
+            stride: [1; 2],
+            padding: [0; 2],
+            dilation: [1; 2],
+            groups: 1,
+            reflect: false,
+            tile: 0,
+            activation: Activation::None,
+        }
     }
 }
 
@@ -55,14 +66,26 @@ impl Conv2d {
         Conv2d { reflect: true, ..self }
     }
 
+    /// The same, with an activation behind it.
+    pub fn activated(self, activation: Activation) -> Self {
+        Conv2d { activation, ..self }
+    }
+
     fn is_pointwise(&self, kernel: [usize; 2]) -> bool {
         kernel == [1, 1] && self.stride == [1; 2] && self.padding == [0; 2] && self.groups == 1
     }
 }
 
+/// A kernel path's names, by the activation behind it.
+macro_rules! paths {
+    ($path:literal) => {
+        [$path, concat!($path, "_relu"), concat!($path, "_hardswish"), concat!($path, "_elu")]
+    };
+}
+
 impl<T: Float> Op<T> for Conv2d {
-    /// The input and the weights, as far as they are needed, and how they lie.
-    type Saved = (Option<Tensor<T>>, Option<Tensor<T>>, Geometry);
+    /// The input and the weights, as far as they are needed, how they lie, and what the activation keeps.
+    type Saved = (Option<Tensor<T>>, Option<Tensor<T>>, Geometry, Option<Tensor<T>>);
 
     fn shape(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError> {
         if let Some(b) = inputs.get(2)
@@ -75,12 +98,22 @@ impl<T: Float> Op<T> for Conv2d {
     }
 
     fn algo(&self, inputs: &[Shape]) -> &'static str {
-        match () {
-            _ if self.is_pointwise([inputs[1].dims()[0], inputs[1].dims()[1]]) => "pointwise",
-            _ if self.groups > 1 => "grouped",
-            _ if self.reflect => "im2col_reflect",
-            _ if self.stride != [1; 2] => "im2col_strided",
-            _ => "im2col",
+        let Ok(g) = Geometry::new(self, &inputs[0], &inputs[1]) else { return "none" };
+        let [plain, relu, hardswish, elu] = match g.side_by_side() {
+            _ if self.is_pointwise(g.kernel) => paths!("pointwise"),
+            _ if self.groups > 1 => paths!("grouped"),
+            1 if self.reflect => paths!("im2col_reflect"),
+            1 if self.stride != [1; 2] => paths!("im2col_strided"),
+            1 => paths!("im2col"),
+            _ if self.reflect => paths!("side_by_side_reflect"),
+            _ if self.stride != [1; 2] => paths!("side_by_side_strided"),
+            _ => paths!("side_by_side"),
+        };
+        match self.activation {
+            Activation::None => plain,
+            Activation::Relu => relu,
+            Activation::Hardswish => hardswish,
+            Activation::Elu => elu,
         }
     }
 
@@ -94,21 +127,29 @@ impl<T: Float> Op<T> for Conv2d {
     fn forward(&self, inputs: &[&Tensor<T>], needs: &Needs) -> (Vec<Tensor<T>>, Self::Saved) {
         let (x, w, b) = (inputs[0], inputs[1], inputs.get(2).map(|b| b.data()));
         let g = Geometry::new(self, x.shape(), w.shape()).expect("checked by the shape rule");
+        // What the backward pass cannot do without is kept in a pass of its own.
+        let keeps_argument = needs.any() && !self.activation.from_result();
+        let finish = Finish::new(b, if keeps_argument { Activation::None } else { self.activation });
         let y = Tensor::build([g.batch, g.out[0], g.out[1], g.out_channels], |out| {
             if self.is_pointwise(g.kernel) {
-                linear::forward(out, Rows::dense(x.data(), x.shape().rows(), g.channels), w.data(), b, 0);
+                linear::forward(out, Rows::dense(x.data(), x.shape().rows(), g.channels), w.data(), &finish, 0);
             } else {
-                kernel::convolve(out, crate::tensor::Accum::Replace, &g, x.data(), w.data(), b);
+                kernel::convolve(out, Accum::Replace, &g, x.data(), w.data(), &finish);
             }
         });
-        (vec![y], (needs.get(1).then(|| x.clone()), needs.get(0).then(|| w.clone()), g))
+        let kept = (needs.any() && self.activation != Activation::None).then(|| y.clone());
+        let y = if keeps_argument { self.activation.of(&y) } else { y };
+        (vec![y], (needs.get(1).then(|| x.clone()), needs.get(0).then(|| w.clone()), g, kept))
     }
 
     /// Each output is a sum of products of a patch and the weights, so
     /// dw = sum over pixels of patch^T dy, db = sum over pixels of dy, and dx collects w dy from every patch that a
     /// pixel is part of: with stride 1 that is itself a convolution of dy, with the window turned by half a circle.
-    fn backward(&self, (x, w, g): Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
-        let dy = upstream.only();
+    ///
+    /// An activation turns dy into the gradient of its argument first.
+    fn backward(&self, (x, w, g, kept): Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
+        let dy = self.activation.backward(kept.as_ref(), upstream.only());
+        drop(kept);
         if let Some(w) = w {
             sink.accumulate(0, |out, accum| match self.is_pointwise(g.kernel) {
                 true => linear::input_gradient(
@@ -147,7 +188,7 @@ impl Checked for Conv2d {
             }
             Case::new(name, op, inputs)
         };
-        vec![
+        let mut cases = vec![
             case("3x3, same size", same, [2, 4, 5, 3], [3, 3, 3, 4], true),
             case("3x3 without bias", same, [2, 4, 5, 3], [3, 3, 3, 4], false),
             case("runs of whole vectors", same, [1, 3, 4, 8], [3, 3, 8, 2], false),
@@ -207,8 +248,41 @@ impl Checked for Conv2d {
                 [3, 3, 2, 2],
                 false,
             ),
+            case("two side by side", same, [2, 3, 6, 2], [3, 3, 2, 16], true),
+            case("four side by side", same, [1, 3, 8, 2], [3, 3, 2, 8], true),
+            case("sixteen side by side", same, [1, 2, 16, 2], [3, 3, 2, 1], false),
+            case("side by side, wider than the image", Conv2d::padded(2), [1, 2, 4, 1], [5, 5, 1, 2], false),
+            case("side by side, 7x7, stride 2", Conv2d::padded(3).strided(2), [1, 5, 8, 2], [7, 7, 2, 4], false),
+            case("side by side, unpadded", Conv2d::default(), [2, 3, 6, 2], [3, 3, 2, 3], true),
+            case("side by side, reflected", same.reflecting(), [2, 3, 8, 2], [3, 3, 2, 3], true),
+            case(
+                "side by side, tile and one",
+                Conv2d { tile: 4, ..same },
+                [1, 5, 4, 2],
+                [3, 3, 2, 2],
+                false,
+            ),
+            case("many channels", same, [1, 3, 5, 1], [3, 3, 1, 70], false),
             case("empty batch", same, [0, 4, 5, 3], [3, 3, 3, 4], true).flat(),
-        ]
+        ];
+        for activation in [Activation::Relu, Activation::Hardswish, Activation::Elu] {
+            let paths = [
+                ("activated", same, [2, 4, 5, 3], [3, 3, 3, 4]),
+                ("activated, reflected", same.reflecting(), [2, 3, 5, 2], [3, 3, 2, 3]),
+                ("activated, stride 2", same.strided(2), [2, 5, 6, 2], [3, 3, 2, 3]),
+                ("activated, 1x1", Conv2d::default(), [2, 3, 4, 5], [1, 1, 5, 3]),
+                ("activated, groups", Conv2d { groups: 2, ..same }, [2, 3, 4, 4], [3, 3, 2, 6]),
+                ("activated, tile and one", Conv2d { tile: 4, ..same }, [1, 5, 3, 2], [3, 3, 2, 2]),
+                ("activated, side by side", same, [1, 3, 4, 2], [3, 3, 2, 3]),
+                ("activated, reflected, side by side", same.reflecting(), [1, 3, 4, 2], [3, 3, 2, 3]),
+                ("activated, stride 2, side by side", Conv2d::padded(3).strided(2), [1, 4, 8, 1], [7, 7, 1, 3]),
+            ];
+            for (name, op, x, w) in paths {
+                cases.push(case(name, op.activated(activation), x, w, true));
+            }
+            cases.push(case("activated without bias", same.activated(activation), [1, 4, 5, 3], [3, 3, 3, 2], false));
+        }
+        cases
     }
 }
 

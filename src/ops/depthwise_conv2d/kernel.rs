@@ -71,7 +71,8 @@ fn band(row: usize) -> usize {
 /// `y = bias + w * x` (cross-correlation) or `y += ...`: x has `batch * height * width` rows, w `kernel` rows, all with
 /// the same number of columns.
 ///
-/// `tile`: rows of the output handed to a thread at a time, chosen by shape if 0.
+/// `tile`: rows of the output handed to a thread at a time, chosen by shape if 0; `done` is called with each of them.
+#[allow(clippy::too_many_arguments)]
 pub(crate) fn forward<T: Float>(
     window: &Window,
     x: Rows<T>,
@@ -80,6 +81,7 @@ pub(crate) fn forward<T: Float>(
     y: RowsMut<T>,
     accum: Accum,
     tile: usize,
+    done: &(dyn Fn(&mut [T]) + Sync),
 ) {
     let ([height, width], c, stride) = (window.out(), x.cols, y.row_stride);
     let taps = window.kernel[0] * window.kernel[1];
@@ -93,7 +95,8 @@ pub(crate) fn forward<T: Float>(
     let tile = if tile > 0 { tile } else { band(width * c * taps) };
     parallel::for_each_chunk(y.data, tile * width * stride, 2 * y.rows * c * taps, |i, out| {
         let pass = Pass { window: *window, height, width, first_row: i * tile, w };
-        dispatch_vector(Convolve { pass, x, bias, out, stride, accum });
+        dispatch_vector(Convolve { pass, x, bias, out: &mut *out, stride, accum });
+        done(out);
     });
 }
 
@@ -319,7 +322,7 @@ pub(crate) fn input_gradient<T: Float>(
             to.copy_from_slice(from);
         }
         let window = Window { height, width, padding: kh - 1 - window.padding, ..*window };
-        return forward(&window, g, &turned, None, dx, accum, tile);
+        return forward(&window, g, &turned, None, dx, accum, tile, &|_| ());
     }
     let tile = if tile > 0 { tile } else { band(window.width * c * kh * kw) };
     parallel::for_each_chunk(dx.data, tile * window.width * stride, 2 * g.rows * c * kh * kw, |i, out| {

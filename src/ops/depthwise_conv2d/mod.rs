@@ -3,13 +3,14 @@
 pub(crate) mod kernel;
 
 use self::kernel::Window;
+use super::fused::{Activation, Finish};
 use super::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::gemm::{Rows, RowsMut};
-use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 
 /// `y[oy, ox, c] = b[c] + sum over ky, kx of x[oy stride + ky - padding, ox stride + kx - padding, c] w[ky, kx, c]`,
 /// where x [batch, height, width, channels] is 0 outside the image; w [kh, kw, channels], b \[channels\].
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub struct DepthwiseConv2d {
     /// Pixels from one position of the window to the next.
     pub stride: usize,
@@ -17,6 +18,8 @@ pub struct DepthwiseConv2d {
     pub padding: usize,
     /// Rows handed to a thread at a time; chosen by shape if 0. A gradient check shrinks it to reach tile edges.
     pub tile: usize,
+    /// What follows, applied to rows while they are in the cache.
+    pub activation: Activation,
 }
 
 impl DepthwiseConv2d {
@@ -28,8 +31,9 @@ impl DepthwiseConv2d {
 }
 
 impl<T: Float> Op<T> for DepthwiseConv2d {
-    /// The input if the weight's gradient is wanted, the weight if the input's is, and their shapes.
-    type Saved = (Option<Tensor<T>>, Option<Tensor<T>>, [Shape; 2]);
+    /// The input if the weight's gradient is wanted, the weight if the input's is, their shapes, and what the
+    /// activation keeps.
+    type Saved = (Option<Tensor<T>>, Option<Tensor<T>>, [Shape; 2], Option<Tensor<T>>);
 
     fn shape(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError> {
         let (x, w) = (inputs[0], inputs[1]);
@@ -49,12 +53,18 @@ impl<T: Float> Op<T> for DepthwiseConv2d {
     }
 
     fn algo(&self, inputs: &[Shape]) -> &'static str {
-        match (&inputs[1].dims()[..2], self.stride) {
-            ([3, 3], 1) => "3x3",
-            ([3, 3], 2) => "3x3_by_2",
-            ([5, 5], 1) => "5x5",
-            ([7, 7], 1) => "7x7",
-            _ => "any",
+        let [plain, relu, hardswish, elu] = match (&inputs[1].dims()[..2], self.stride) {
+            ([3, 3], 1) => ["3x3", "3x3_relu", "3x3_hardswish", "3x3_elu"],
+            ([3, 3], 2) => ["3x3_by_2", "3x3_by_2_relu", "3x3_by_2_hardswish", "3x3_by_2_elu"],
+            ([5, 5], 1) => ["5x5", "5x5_relu", "5x5_hardswish", "5x5_elu"],
+            ([7, 7], 1) => ["7x7", "7x7_relu", "7x7_hardswish", "7x7_elu"],
+            _ => ["any", "any_relu", "any_hardswish", "any_elu"],
+        };
+        match self.activation {
+            Activation::None => plain,
+            Activation::Relu => relu,
+            Activation::Hardswish => hardswish,
+            Activation::Elu => elu,
         }
     }
 
@@ -68,19 +78,27 @@ impl<T: Float> Op<T> for DepthwiseConv2d {
         let (window, c) = (self.window(x.shape(), w.shape()).expect("checked by the shape rule"), x.shape().last());
         let [height, width] = window.output().expect("checked by the shape rule");
         let shape = x.shape().with(1, height).with(2, width);
+        // What the backward pass cannot do without is kept in a pass of its own.
+        let keeps_argument = needs.any() && !self.activation.from_result();
+        let finish = Finish::new(None, if keeps_argument { Activation::None } else { self.activation });
         let y = Tensor::build(shape, |out| {
             let x = Rows::dense(x.data(), x.shape().rows(), c);
             let y = RowsMut::dense(out, shape.rows(), c);
-            kernel::forward(&window, x, w.data(), b.map(|b| b.data()), y, crate::tensor::Accum::Replace, self.tile);
+            let bias = b.map(|b| b.data());
+            kernel::forward(&window, x, w.data(), bias, y, Accum::Replace, self.tile, &|rows| finish.run(rows));
         });
-        let saved = (needs.get(1).then(|| x.clone()), needs.get(0).then(|| w.clone()), [*x.shape(), *w.shape()]);
-        (vec![y], saved)
+        let kept = (needs.any() && self.activation != Activation::None).then(|| y.clone());
+        let y = if keeps_argument { self.activation.of(&y) } else { y };
+        (vec![y], (needs.get(1).then(|| x.clone()), needs.get(0).then(|| w.clone()), [*x.shape(), *w.shape()], kept))
     }
 
     /// With i = o stride + k - padding: dx\[i\] = sum over those k, o of dy\[o\] w\[k\]; dw\[k\] = sum over o of x\[i\] dy\[o\];
     /// db = the sum of dy's pixels.
-    fn backward(&self, (x, w, shapes): Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
-        let g = upstream.only();
+    ///
+    /// An activation turns dy into the gradient of its argument first.
+    fn backward(&self, (x, w, shapes, kept): Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
+        let g = self.activation.backward(kept.as_ref(), upstream.only());
+        drop(kept);
         let window = self.window(&shapes[0], &shapes[1]).expect("checked by the shape rule");
         let c = g.shape().last();
         let g = Rows::dense(g.data(), g.shape().rows(), c);
@@ -105,9 +123,9 @@ impl Checked for DepthwiseConv2d {
         let x = |shape: &[usize]| Input::random("x", shape);
         let w = |kh: usize, kw: usize, c: usize| Input::random("w", [kh, kw, c]);
         let b = |c: usize| Input::random("b", [c]);
-        let op = |stride, padding| DepthwiseConv2d { stride, padding, tile: 0 };
-        let tiled = |tile| DepthwiseConv2d { stride: 1, padding: 1, tile };
-        vec![
+        let op = |stride, padding| DepthwiseConv2d { stride, padding, ..DepthwiseConv2d::default() };
+        let tiled = |tile| DepthwiseConv2d { tile, ..op(1, 1) };
+        let mut cases = vec![
             Case::new("3x3, a whole block", op(1, 1), [x(&[2, 2, 7, 16]), w(3, 3, 16), b(16)]),
             Case::new("3x3, overlapping blocks", op(1, 1), [x(&[2, 2, 6, 18]), w(3, 3, 18)]),
             Case::new("3x3, narrow", op(1, 1), [x(&[2, 3, 7, 8]), w(3, 3, 8), b(8)]),
@@ -133,11 +151,23 @@ impl Checked for DepthwiseConv2d {
             Case::new("tile and one", tiled(4), [x(&[1, 5, 5, 8]), w(3, 3, 8)]),
             Case::new(
                 "tiles by 2",
-                DepthwiseConv2d { stride: 2, padding: 1, tile: 2 },
+                DepthwiseConv2d { tile: 2, ..op(2, 1) },
                 [x(&[2, 5, 4, 8]), w(3, 3, 8), b(8)],
             ),
             Case::new("no image", op(1, 1), [x(&[0, 3, 3, 8]), w(3, 3, 8), b(8)]).flat(),
-        ]
+        ];
+        for activation in [Activation::Relu, Activation::Hardswish, Activation::Elu] {
+            let activated = |op| DepthwiseConv2d { activation, ..op };
+            cases.extend([
+                Case::new("3x3, activated", activated(op(1, 1)), [x(&[2, 2, 7, 16]), w(3, 3, 16), b(16)]),
+                Case::new("3x3 by 2, activated", activated(op(2, 1)), [x(&[1, 3, 9, 17]), w(3, 3, 17), b(17)]),
+                Case::new("5x5, activated", activated(op(1, 2)), [x(&[1, 3, 6, 18]), w(5, 5, 18)]),
+                Case::new("7x7, activated", activated(op(1, 3)), [x(&[1, 3, 8, 12]), w(7, 7, 12), b(12)]),
+                Case::new("2x3 by 3, activated", activated(op(3, 1)), [x(&[2, 5, 7, 8]), w(2, 3, 8), b(8)]),
+                Case::new("tile and one, activated", activated(tiled(4)), [x(&[1, 5, 5, 8]), w(3, 3, 8)]),
+            ]);
+        }
+        cases
     }
 }
 
@@ -146,7 +176,12 @@ impl<T: Float> Var<T> {
     /// bias \[channels\]. `padding` zeros on each side.
     #[track_caller]
     pub fn depthwise_conv2d(&self, weight: &Self, bias: Option<&Self>, stride: usize, padding: usize) -> Self {
-        let op = DepthwiseConv2d { stride, padding, tile: 0 };
+        self.depthwise(weight, bias, DepthwiseConv2d { stride, padding, ..DepthwiseConv2d::default() })
+    }
+
+    /// The same, with all its attributes.
+    #[track_caller]
+    pub fn depthwise(&self, weight: &Self, bias: Option<&Self>, op: DepthwiseConv2d) -> Self {
         match bias {
             Some(bias) => apply1(op, &[self, weight, bias]),
             None => apply1(op, &[self, weight]),
@@ -223,7 +258,7 @@ mod tests {
             let g_part = Rows::columns(g.data(), out_rows, wide, first, c);
             let mut out = Tensor::full([out_rows, wide], 0.5);
             let to = RowsMut::columns(out.data_mut(), out_rows, wide, first, c);
-            kernel::forward(&window, x_part, w.data(), None, to, Accum::Replace, 0);
+            kernel::forward(&window, x_part, w.data(), None, to, Accum::Replace, 0, &|_| ());
             assert!(columns(&out).reshape(*y.shape()).same_bits(y.value()));
             assert_eq!(out.data().iter().filter(|&&v| v == 0.5).count(), out_rows * (wide - c));
 
