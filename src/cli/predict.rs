@@ -26,9 +26,6 @@ mod outputs;
 
 use outputs::{Job, Outputs, jobs};
 
-/// The horizontal field of view, in degrees, whose focal length is 0.58 of the width: KITTI's.
-const KITTI_VIEW: f64 = 81.5;
-
 #[derive(clap::Args)]
 #[command(after_long_help = AFTER)]
 pub struct Args {
@@ -37,21 +34,24 @@ pub struct Args {
     weights: PathBuf,
     /// Pictures (PNG, JPEG, WebP), or folders of them.
     ///
-    /// Of a folder everything below it, frame2 before frame10; hidden files and links to folders are passed over.
-    /// Pictures of any size up to 100 megapixels, turned as their EXIF orientation says; alpha is ignored.
-    #[arg(required = true, value_name = "INPUT")]
+    /// Of a folder everything below it, frame2 before frame10; hidden files and links to folders are
+    /// passed over. Pictures of any size up to 100 megapixels, turned as their EXIF orientation says;
+    /// alpha is ignored.
+    #[arg(required = true, value_name = "INPUT", verbatim_doc_comment)]
     inputs: Vec<PathBuf>,
     /// Where the results go; made if it is missing.
     ///
-    /// A picture's results bear its name, a folder's lie as its pictures do. With several inputs every folder's go
-    /// under its own name. Two pictures whose results would be one file are an error before any work.
-    #[arg(long, value_name = "DIR")]
+    /// A picture's results bear its name; those of a folder lie as its pictures do. With several inputs
+    /// each folder's results go into a folder of its own name. Two pictures whose results would be the
+    /// same file, or that would overwrite a picture, are an error before any work.
+    #[arg(long, value_name = "DIR", verbatim_doc_comment)]
     out: PathBuf,
     /// Print one JSON object: what was made of every picture, and what failed.
     ///
-    /// `weights, height, width` (of the network), `pictures: [{input, outputs: {disparity, depth, inverse_depth, points},
-    /// width, height, factor, median_depth, seconds}], failed: [{input, error}], seconds`.
-    #[arg(long)]
+    /// weights, height, width (of the network), pictures: [{input, outputs: {disparity, depth,
+    /// inverse_depth, points}, width, height, factor, median_depth, seconds}], failed: [{input, error}],
+    /// seconds.
+    #[arg(long, verbatim_doc_comment)]
     json: bool,
     /// Also NAME_depth.png: 16-bit grey, depth * 256, as KITTI stores it.
     ///
@@ -64,52 +64,54 @@ pub struct Args {
     /// Also NAME.ply: every pixel as a coloured point; x right, y down, z forward.
     #[arg(long, help_heading = "Results")]
     ply: bool,
-    /// Predict on the mirrored picture too, and join both: slower, better at the borders of things.
+    /// Predict on the mirrored picture too, and join both: twice the time, better borders.
     #[arg(long, help_heading = "Network")]
     flip: bool,
-    /// The height at which the network sees the pictures, a multiple of 32; that of its training unless given.
+    /// Height of the network's pictures, a multiple of 32; that of its training unless given.
     #[arg(long, value_name = "PIXELS", help_heading = "Network")]
     height: Option<usize>,
-    /// The width, likewise.
+    /// Their width, likewise.
     #[arg(long, value_name = "PIXELS", help_heading = "Network")]
     width: Option<usize>,
     /// Depths are multiplied by this; 1 unless given.
     #[arg(long, value_name = "FACTOR", group = "unit", help_heading = "Scale (one of)", value_parser = above_zero)]
     scale: Option<f64>,
-    /// Metres for weights that were trained on stereo pairs whose baseline of 0.54 m was called 0.1: --scale 5.4.
+    /// Metres for weights from stereo pairs whose baseline of 0.54 m was called 0.1: --scale 5.4.
     #[arg(long, group = "unit", help_heading = "Scale (one of)")]
     stereo: bool,
-    /// Metres from the camera's height over the road, for every picture on its own; 1.65 for KITTI.
+    /// Metres by the camera's known height over the road (KITTI: 1.65), for every picture on its own.
     #[arg(long, value_name = "METRES", group = "unit", help_heading = "Scale (one of)", value_parser = above_zero)]
     camera_height: Option<f64>,
     /// Focal lengths and principal point in pixels of the pictures.
     #[arg(long, value_name = "FX,FY,CX,CY", group = "camera", help_heading = "Camera (for --ply, --camera-height)")]
     #[arg(value_parser = pinhole)]
     intrinsics: Option<[f64; 4]>,
-    /// The horizontal field of view, for square pixels and the principal point in the middle.
+    /// Horizontal field of view, for square pixels around the middle; KITTI's 81.5 unless given.
     #[arg(long, value_name = "DEGREES", group = "camera", help_heading = "Camera (for --ply, --camera-height)")]
-    #[arg(default_value_t = KITTI_VIEW, value_parser = field_of_view)]
-    fov: f64,
+    #[arg(value_parser = field_of_view)]
+    fov: Option<f64>,
 }
 
 const AFTER: &str = "\
 What is written:
-  NAME_disp.png is there to be looked at: inverse depth in magma, near is bright, from its smallest value to its 95th
-  percentile. All other results are numbers, at the picture's own size.
+  NAME_disp.png is there to be looked at: inverse depth in magma, near is bright, from its smallest
+  value to its 95th percentile. All other results are numbers, at the picture's own size.
 
 Scale:
-  Weights that learnt from one moving camera know depth up to a factor. --camera-height finds it on the road: every
-  pixel of the prediction has a tangent plane; where that is level to 5 degrees it is ground, and the median distance
-  of these planes from the camera is how high the camera hangs in the prediction's unit. The factor is the given height
-  over that one. The camera has to be held level, and the road seen: a picture in which less than a hundredth is level
-  fails. The factor of each picture stands in --json; for the frames of one video, their median as --scale is steadier.
+  Weights that learnt from one moving camera know depth up to a factor. --camera-height finds it on
+  the road: every pixel of the prediction has a tangent plane; where that is level to 5 degrees it is
+  ground, and the median distance of these planes from the camera is the camera's height h in the
+  prediction's unit. Depths are multiplied by METRES / h. The camera has to be held level and to see
+  the road: a picture of which less than a hundredth is level fails. --json says the factor of each
+  picture; for the frames of one video their median, given as --scale, is steadier.
 
 Camera:
-  Without --intrinsics or --fov the camera is KITTI's: a focal length of 0.58 of the width. With another lens the points
-  lie too near or too far to the sides, and --camera-height is off by the same ratio.
+  Without --intrinsics or --fov it is KITTI's: a focal length of 0.58 of the width. With another lens
+  points lie too far to the sides or too little, and --camera-height is off by the same ratio.
 
 Exit status:
-  0 all pictures are done; 1 something failed, what it was stands on standard error, and all else is done; 2 wrong usage.
+  0 all pictures are done; 1 something failed: what, is said on standard error, and the other
+  pictures are done; 2 wrong usage.
 
 Examples:
   parallax predict --weights runs/1 pictures/ --out depth/
@@ -254,7 +256,8 @@ impl Args {
     /// The camera of a picture of `width x height` pixels.
     fn camera(&self, width: f64, height: f64) -> Intrinsics {
         let [fx, fy, cx, cy] = self.intrinsics.unwrap_or_else(|| {
-            let focal = width / 2.0 / (self.fov.to_radians() / 2.0).tan();
+            // Half the width over the tangent of half the view.
+            let focal = self.fov.map_or(Intrinsics::KITTI.fx, |fov| 0.5 / (fov / 2.0).to_radians().tan()) * width;
             [focal, focal, (width - 1.0) / 2.0, (height - 1.0) / 2.0]
         });
         Intrinsics { fx: fx / width, fy: fy / height, cx: cx / width, cy: cy / height }
@@ -277,12 +280,6 @@ impl Args {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn the_default_view_is_kittis() {
-        let focal = 0.5 / (KITTI_VIEW.to_radians() / 2.0).tan();
-        assert!((focal - Intrinsics::KITTI.fx).abs() < 1e-3, "{focal}");
-    }
 
     #[test]
     fn numbers_from_the_command_line_are_checked() {
@@ -330,5 +327,18 @@ mod tests {
         let nowhere = args(&["--camera-height", "1.65"]);
         let error = nowhere.factor(&input, &vec![0.1; 24 * 80], size, nowhere.camera(80.0, 24.0)).unwrap_err();
         assert!(error.to_string().contains("a.png: no road"), "{error}");
+    }
+
+    #[test]
+    fn the_camera_is_kittis_unless_given() {
+        let close = |a: Intrinsics, b: Intrinsics, by: f64| {
+            let pairs = [(a.fx, b.fx), (a.fy, b.fy), (a.cx, b.cx), (a.cy, b.cy)];
+            assert!(pairs.iter().all(|(a, b)| (a / b - 1.0).abs() < by), "{a:?} {b:?}");
+        };
+        // The published constants are those of KITTI's pictures, up to half a pixel.
+        close(args(&[]).camera(1242.0, 375.0), Intrinsics::KITTI, 4e-3);
+        close(args(&["--fov", "81.5"]).camera(640.0, 480.0), args(&[]).camera(640.0, 480.0), 1e-3);
+        let given = args(&["--intrinsics", "700,710,600,170"]).camera(1000.0, 500.0);
+        close(given, Intrinsics { fx: 0.7, fy: 1.42, cx: 0.6, cy: 0.34 }, 1e-12);
     }
 }
