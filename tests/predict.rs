@@ -80,8 +80,11 @@ fn read_npy(path: &Path) -> (usize, usize, Vec<f32>) {
     (sides[0], sides[1], values)
 }
 
-/// The points and colours of a cloud.
-fn read_ply(path: &Path) -> Vec<([f32; 3], [u8; 3])> {
+/// A point and its colour.
+type Point = ([f32; 3], [u8; 3]);
+
+/// The points of a cloud.
+fn read_ply(path: &Path) -> Vec<Point> {
     let bytes = fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
     let end = bytes.windows(11).position(|w| w == b"end_header\n").expect("a header") + 11;
     let header = std::str::from_utf8(&bytes[..end]).expect("text");

@@ -63,8 +63,11 @@ fn write_header(writer: &mut impl Write, points: usize) -> io::Result<()> {
 mod tests {
     use super::*;
 
+    /// A point and its colour.
+    type Point = ([f32; 3], [u8; 3]);
+
     /// The header's lines, and the points.
-    fn parse(bytes: &[u8]) -> (Vec<&str>, Vec<([f32; 3], [u8; 3])>) {
+    fn parse(bytes: &[u8]) -> (Vec<&str>, Vec<Point>) {
         let end = b"end_header\n";
         let at = bytes.windows(end.len()).position(|w| w == end).unwrap();
         let header = std::str::from_utf8(&bytes[..at]).unwrap().lines().collect();
