@@ -43,6 +43,18 @@ pub fn write_bytes_atomically(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()
     write_atomically(path, |writer| writer.write_all(bytes))
 }
 
+/// Makes sure that files can be written into a folder, which is made if it is missing: to be called before anything
+/// that takes time.
+///
+/// # Errors
+/// If the folder cannot be made, or nothing can be written into it.
+pub fn check_writable(folder: &Path) -> Result<()> {
+    fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
+    let probe = folder.join(".writable");
+    write_bytes_atomically(&probe, b"")?;
+    fs::remove_file(&probe).map_err(|e| Error::io(probe, e))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -55,6 +67,18 @@ mod tests {
         write_bytes_atomically(&path, b"two").unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"two");
         assert_eq!(fs::read_dir(path.parent().unwrap()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_folder_that_can_be_written_into_is_made_and_left_empty() {
+        let place = tempfile::tempdir().unwrap();
+        let folder = place.path().join("a/b");
+        check_writable(&folder).unwrap();
+        check_writable(&folder).unwrap();
+        assert_eq!(fs::read_dir(&folder).unwrap().count(), 0);
+        fs::write(place.path().join("file"), "mine").unwrap();
+        let error = check_writable(&place.path().join("file/inside")).unwrap_err().to_string();
+        assert!(error.contains("inside"), "{error}");
     }
 
     #[test]

@@ -1,115 +1,344 @@
 //! `parallax predict`.
 
-use std::fs;
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
-use parallax::data::DepthMap;
+use image::RgbImage;
+use parallax::data::inputs::{Input, find_pictures};
 use parallax::data::picture::read_picture;
 use parallax::data::resize::lanczos;
-use parallax::files::write_bytes_atomically;
+use parallax::data::{DepthMap, Intrinsics};
+use parallax::files::{check_writable, write_bytes_atomically};
+use parallax::monovit::camera_height::find_ground;
 use parallax::monovit::evaluation::Predictor;
-use parallax::monovit::metrics::resize_bilinear;
-use parallax::monovit::run::load_weights;
+use parallax::monovit::metrics::{STEREO_SCALE, median, resize_bilinear};
+use parallax::monovit::run::{check_size, load_weights};
 use parallax::report::colormap::disparity_to_image;
 use parallax::report::depth_png::write_depth_png;
 use parallax::report::npy::write_npy;
+use parallax::report::ply::write_point_cloud;
 use parallax::{Error, Result};
+use serde::Serialize;
 
 use super::progress::Progress;
 
+mod outputs;
+
+use outputs::{Job, Outputs, jobs};
+
 #[derive(clap::Args)]
+#[command(after_long_help = AFTER)]
 pub struct Args {
     /// Weights, or a run's folder (its best weights).
     #[arg(long, value_name = "FILE|RUN")]
     weights: PathBuf,
-    /// Pictures (PNG, JPEG), or folders of them.
-    #[arg(required = true, value_name = "INPUT")]
+    /// Pictures (PNG, JPEG, WebP), or folders of them.
+    ///
+    /// Of a folder everything below it, frame2 before frame10; hidden files and links to folders are
+    /// passed over. Pictures of any size up to 100 megapixels, turned as their EXIF orientation says;
+    /// alpha is ignored.
+    #[arg(required = true, value_name = "INPUT", verbatim_doc_comment)]
     inputs: Vec<PathBuf>,
-    /// Where the maps go: NAME_disp.png for every picture.
-    #[arg(long, value_name = "DIR")]
+    /// Where the results go; made if it is missing.
+    ///
+    /// A picture's results bear its name; those of a folder lie as its pictures do. With several inputs
+    /// each folder's results go into a folder of its own name. Two pictures whose results would be the
+    /// same file, or that would overwrite a picture, are an error before any work.
+    #[arg(long, value_name = "DIR", verbatim_doc_comment)]
     out: PathBuf,
-    /// Also NAME_depth.png: 16 bit, metres * 256 (up to scale, as the weights see it).
-    #[arg(long)]
+    /// Print one JSON object: what was made of every picture, and what failed.
+    ///
+    /// weights, height, width (of the network), pictures: [{input, outputs: {disparity, depth,
+    /// inverse_depth, points}, width, height, factor, median_depth, seconds}], failed: [{input, error}],
+    /// seconds.
+    #[arg(long, verbatim_doc_comment)]
+    json: bool,
+    /// Also NAME_depth.png: 16-bit grey, depth * 256, as KITTI stores it.
+    ///
+    /// 0 would mean unknown and does not occur; depths beyond 255.996 become 255.996, the largest that fits.
+    #[arg(long, help_heading = "Results")]
     depth_png: bool,
-    /// Also NAME.npy: inverse depth as f32, `[height, width]`.
-    #[arg(long)]
+    /// Also NAME.npy: inverse depth as 32-bit floats, `[height, width]`.
+    #[arg(long, help_heading = "Results")]
     npy: bool,
-    /// Depths are multiplied by this.
-    #[arg(long, value_name = "FACTOR", default_value_t = 1.0)]
-    scale: f64,
-    /// Predict on the mirrored picture too, and join both.
-    #[arg(long)]
+    /// Also NAME.ply: every pixel as a coloured point; x right, y down, z forward.
+    #[arg(long, help_heading = "Results")]
+    ply: bool,
+    /// Predict on the mirrored picture too, and join both: twice the time, better borders.
+    #[arg(long, help_heading = "Network")]
     flip: bool,
+    /// Height of the network's pictures, a multiple of 32; that of its training unless given.
+    #[arg(long, value_name = "PIXELS", help_heading = "Network")]
+    height: Option<usize>,
+    /// Their width, likewise.
+    #[arg(long, value_name = "PIXELS", help_heading = "Network")]
+    width: Option<usize>,
+    /// Depths are multiplied by this; 1 unless given.
+    #[arg(long, value_name = "FACTOR", group = "unit", help_heading = "Scale (one of)", value_parser = above_zero)]
+    scale: Option<f64>,
+    /// Metres for weights from stereo pairs whose baseline of 0.54 m was called 0.1: --scale 5.4.
+    #[arg(long, group = "unit", help_heading = "Scale (one of)")]
+    stereo: bool,
+    /// Metres by the camera's known height over the road (KITTI: 1.65), for every picture on its own.
+    #[arg(long, value_name = "METRES", group = "unit", help_heading = "Scale (one of)", value_parser = above_zero)]
+    camera_height: Option<f64>,
+    /// Focal lengths and principal point in pixels of the pictures.
+    #[arg(long, value_name = "FX,FY,CX,CY", group = "camera", help_heading = "Camera (for --ply, --camera-height)")]
+    #[arg(value_parser = pinhole)]
+    intrinsics: Option<[f64; 4]>,
+    /// Horizontal field of view, for square pixels around the middle; KITTI's 81.5 unless given.
+    #[arg(long, value_name = "DEGREES", group = "camera", help_heading = "Camera (for --ply, --camera-height)")]
+    #[arg(value_parser = field_of_view)]
+    fov: Option<f64>,
+}
+
+const AFTER: &str = "\
+What is written:
+  NAME_disp.png is there to be looked at: inverse depth in magma, near is bright, from its smallest
+  value to its 95th percentile. All other results are numbers, at the picture's own size.
+
+Scale:
+  Weights that learnt from one moving camera know depth up to a factor. --camera-height finds it on
+  the road: every pixel of the prediction has a tangent plane; where that is level to 5 degrees it is
+  ground, and the median distance of these planes from the camera is the camera's height h in the
+  prediction's unit. Depths are multiplied by METRES / h. The camera has to be held level and to see
+  the road: a picture of which less than a hundredth is level fails. --json says the factor of each
+  picture; for the frames of one video their median, given as --scale, is steadier.
+
+Camera:
+  Without --intrinsics or --fov it is KITTI's: a focal length of 0.58 of the width. With another lens
+  points lie too far to the sides or too little, and --camera-height is off by the same ratio.
+
+Exit status:
+  0 all pictures are done; 1 something failed: what, is said on standard error, and the other
+  pictures are done; 2 wrong usage.
+
+Examples:
+  parallax predict --weights runs/1 pictures/ --out depth/
+  parallax predict --weights runs/1 drive/ --out depth/ --camera-height 1.65 --ply --depth-png
+  parallax predict --weights runs/1 phone.jpg --out depth/ --ply --fov 67 --flip";
+
+fn above_zero(text: &str) -> Result<f64, String> {
+    let number = text.parse::<f64>().ok().filter(|x| *x > 0.0 && x.is_finite());
+    number.ok_or_else(|| "expected a number above 0".to_owned())
+}
+
+fn field_of_view(text: &str) -> Result<f64, String> {
+    let number = text.parse::<f64>().ok().filter(|x| (1.0..=175.0).contains(x));
+    number.ok_or_else(|| "expected degrees from 1 to 175".to_owned())
+}
+
+fn pinhole(text: &str) -> Result<[f64; 4], String> {
+    let numbers: Option<Vec<f64>> =
+        text.split(',').map(|n| n.trim().parse().ok().filter(|x: &f64| x.is_finite())).collect();
+    let camera = numbers.and_then(|n| <[f64; 4]>::try_from(n).ok()).filter(|[fx, fy, ..]| *fx > 0.0 && *fy > 0.0);
+    camera.ok_or_else(|| "expected four numbers with commas between them, fx and fy above 0".to_owned())
+}
+
+/// What was done, as JSON.
+#[derive(Serialize)]
+struct Summary {
+    weights: String,
+    /// The size at which the network saw the pictures.
+    height: usize,
+    width: usize,
+    pictures: Vec<Done>,
+    failed: Vec<Failure>,
+    seconds: f64,
+}
+
+#[derive(Serialize)]
+struct Done {
+    input: String,
+    outputs: Outputs,
+    width: usize,
+    height: usize,
+    /// What depths were multiplied by.
+    factor: f64,
+    /// The median of the depths, after that.
+    median_depth: f64,
+    seconds: f64,
+}
+
+#[derive(Serialize)]
+struct Failure {
+    input: String,
+    error: String,
 }
 
 pub fn run(args: Args) -> Result<()> {
-    if !(args.scale > 0.0 && args.scale.is_finite()) {
-        return Err(Error::setting("--scale", format!("{} is not a number above 0", args.scale)));
+    let started = Instant::now();
+    for (name, size) in [("--height", args.height), ("--width", args.width)] {
+        size.map_or(Ok(()), |size| check_size(name, size))?;
     }
+    let jobs = jobs(find_pictures(&args.inputs, &args.out)?, &args)?;
     let (model, params, config) = load_weights(&args.weights)?;
-    let pictures = pictures(&args.inputs)?;
+    check_writable(&args.out)?;
     let predictor = Predictor::new(&model, &params, &config.loss);
-    let mut progress = Progress::new("pictures", pictures.len() as u64);
-    let mut failed = 0;
-    for (i, path) in pictures.iter().enumerate() {
+    let size = (args.height.unwrap_or(config.height), args.width.unwrap_or(config.width));
+    let mut progress = Progress::new("pictures", jobs.len() as u64);
+    let (mut done, mut failed) = (Vec::new(), Vec::new());
+    for (i, job) in jobs.into_iter().enumerate() {
+        let input = job.input.path.to_string_lossy().into_owned();
         // The rest of a folder still gets done; the exit status says that something was not.
-        if let Err(error) = predict(&args, &predictor, path, (config.height, config.width)) {
-            progress.say(&format!("parallax: {error}"));
-            failed += 1;
+        match predict(&args, &predictor, job, size) {
+            Ok(picture) => done.push(picture),
+            Err(error) => {
+                progress.say(&format!("parallax: {error}"));
+                failed.push(Failure { input, error: error.to_string() });
+            }
         }
         progress.set(i as u64 + 1, "");
     }
     progress.finish();
-    match failed {
+    if args.camera_height.is_some()
+        && done.len() > 1
+        && let Some(factor) = median(done.iter().map(|picture| picture.factor).collect())
+    {
+        eprintln!("the median factor is {factor:.3}: --scale {factor:.3} gives all pictures the same");
+    }
+    let (all, failures) = (done.len() + failed.len(), failed.len());
+    if args.json {
+        let (weights, seconds) = (args.weights.to_string_lossy().into_owned(), started.elapsed().as_secs_f64());
+        super::print_json(&Summary { weights, height: size.0, width: size.1, pictures: done, failed, seconds })?;
+    }
+    match failures {
         0 => Ok(()),
-        n => Err(Error::Failed(format!("{n} of {} pictures could not be done (see above)", pictures.len()))),
+        n => Err(Error::Failed(format!("{n} of {all} pictures could not be done (see above)"))),
     }
 }
 
-fn predict(args: &Args, predictor: &Predictor, path: &Path, (height, width): (usize, usize)) -> Result<()> {
-    let picture = read_picture(path)?;
+fn predict(args: &Args, predictor: &Predictor, job: Job, (height, width): (usize, usize)) -> Result<Done> {
+    let started = Instant::now();
+    let picture = read_picture(&job.input.path)?;
     let (w, h) = (picture.width() as usize, picture.height() as usize);
-    let seen = lanczos(&picture, width as u32, height as u32);
-    let inverse = resize_bilinear(&predictor.inverse_depth(&seen, args.flip), (height, width), (h, w));
-    let inverse: Vec<f32> = inverse.into_iter().map(|x| x as f32).collect();
-    let stem = path.file_stem().unwrap_or(path.as_os_str()).to_string_lossy();
-    let to = |ending: &str| args.out.join(format!("{stem}{ending}"));
-    let map = to("_disp.png");
-    let mut bytes = std::io::Cursor::new(Vec::new());
-    disparity_to_image(&inverse, w, h)
-        .write_to(&mut bytes, image::ImageFormat::Png)
-        .map_err(|e| Error::file(&map, format!("could not be encoded: {e}")))?;
-    write_bytes_atomically(&map, bytes.get_ref())?;
-    if args.npy {
-        write_npy(to(".npy"), &inverse, h, w)?;
+    let camera = args.camera(w as f64, h as f64);
+    let map = predictor.inverse_depth(&lanczos(&picture, width as u32, height as u32), args.flip);
+    let factor = args.factor(&job.input, &map, (height, width), camera)?;
+    let median_depth = median(map.iter().map(|&d| factor / f64::from(d)).collect()).unwrap_or(f64::NAN);
+    let inverse = resize_bilinear(&map, (height, width), (h, w));
+    let inverse: Vec<f32> = inverse.into_iter().map(|d| (d / factor) as f32).collect();
+    write(&job.outputs, &picture, inverse, camera)?;
+    let input = job.input.path.to_string_lossy().into_owned();
+    let seconds = started.elapsed().as_secs_f64();
+    Ok(Done { input, outputs: job.outputs, width: w, height: h, factor, median_depth, seconds })
+}
+
+/// Writes what is wanted of a picture's inverse depth.
+fn write(outputs: &Outputs, picture: &RgbImage, inverse: Vec<f32>, camera: Intrinsics) -> Result<()> {
+    let (width, height) = (picture.width() as usize, picture.height() as usize);
+    write_png(&outputs.disparity, &disparity_to_image(&inverse, width, height))?;
+    if let Some(path) = &outputs.inverse_depth {
+        write_npy(path, &inverse, height, width)?;
     }
-    if args.depth_png {
-        let metres = inverse.iter().map(|&d| (args.scale / f64::from(d)) as f32).collect();
-        write_depth_png(to("_depth.png"), &DepthMap { width: w, height: h, metres })?;
+    if outputs.depth.is_none() && outputs.points.is_none() {
+        return Ok(());
+    }
+    let depth = DepthMap { width, height, metres: inverse.into_iter().map(|d| 1.0 / d).collect() };
+    if let Some(path) = &outputs.depth {
+        write_depth_png(path, &depth)?;
+    }
+    if let Some(path) = &outputs.points {
+        write_point_cloud(path, &depth, picture, camera)?;
     }
     Ok(())
 }
 
-/// The pictures among the inputs, and inside those that are folders, in order of name.
-fn pictures(inputs: &[PathBuf]) -> Result<Vec<PathBuf>> {
-    let mut all = Vec::new();
-    for input in inputs {
-        if !input.is_dir() {
-            // What is missing is found out when it is read, by name.
-            all.push(input.clone());
-            continue;
-        }
-        let entries = fs::read_dir(input).map_err(|e| Error::io(input, e))?;
-        let mut inside: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).filter(|p| is_picture(p)).collect();
-        if inside.is_empty() {
-            return Err(Error::file(input, "holds no PNG or JPEG pictures"));
-        }
-        inside.sort();
-        all.extend(inside);
-    }
-    Ok(all)
+fn write_png(path: &Path, picture: &RgbImage) -> Result<()> {
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    picture
+        .write_to(&mut bytes, image::ImageFormat::Png)
+        .map_err(|e| Error::file(path, format!("could not be encoded: {e}")))?;
+    write_bytes_atomically(path, bytes.get_ref())
 }
 
-fn is_picture(path: &Path) -> bool {
-    path.extension().is_some_and(|e| ["png", "jpg", "jpeg"].iter().any(|known| e.eq_ignore_ascii_case(known)))
+impl Args {
+    /// The camera of a picture of `width x height` pixels.
+    fn camera(&self, width: f64, height: f64) -> Intrinsics {
+        let [fx, fy, cx, cy] = self.intrinsics.unwrap_or_else(|| {
+            // Half the width over the tangent of half the view.
+            let focal = self.fov.map_or(Intrinsics::KITTI.fx, |fov| 0.5 / (fov / 2.0).to_radians().tan()) * width;
+            [focal, focal, (width - 1.0) / 2.0, (height - 1.0) / 2.0]
+        });
+        Intrinsics { fx: fx / width, fy: fy / height, cx: cx / width, cy: cy / height }
+    }
+
+    /// What a picture's depths are multiplied by; `map` is its inverse depth as predicted.
+    fn factor(&self, input: &Input, map: &[f32], size: (usize, usize), camera: Intrinsics) -> Result<f64> {
+        let Some(metres) = self.camera_height else {
+            return Ok(if self.stereo { STEREO_SCALE } else { self.scale.unwrap_or(1.0) });
+        };
+        let ground = find_ground(map, size, camera).ok_or_else(|| {
+            let message = "no road was found to measure the camera's height over: give --scale instead, or the \
+                           camera's --intrinsics or --fov if it is not KITTI's";
+            Error::file(&input.path, message)
+        })?;
+        Ok(metres / ground.camera_height)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_from_the_command_line_are_checked() {
+        assert_eq!(pinhole("721.5, 722,609,172.8"), Ok([721.5, 722.0, 609.0, 172.8]));
+        for wrong in ["", "1,2,3", "1,2,3,4,5", "0,1,2,3", "1,-1,2,3", "1,2,nan,3", "a,b,c,d"] {
+            assert!(pinhole(wrong).is_err(), "{wrong}");
+        }
+        assert_eq!(above_zero("1.65"), Ok(1.65));
+        for wrong in ["0", "-1", "nan", "inf", "x"] {
+            assert!(above_zero(wrong).is_err(), "{wrong}");
+        }
+        assert!(field_of_view("67").is_ok() && field_of_view("0").is_err() && field_of_view("180").is_err());
+    }
+
+    #[derive(clap::Parser)]
+    struct Command {
+        #[command(flatten)]
+        args: Args,
+    }
+
+    fn args(more: &[&str]) -> Args {
+        let all = ["predict", "--weights", "w", "a.png", "--out", "o"].iter().chain(more);
+        <Command as clap::Parser>::try_parse_from(all).map(|command| command.args).unwrap()
+    }
+
+    #[test]
+    fn every_flag_of_the_scale_gives_its_factor() {
+        let input = Input { path: "a.png".into(), name: "a".into() };
+        let size = (24, 80);
+        // A road: inverse depth grows with the row below the horizon. Its camera hangs half a unit above it.
+        let road: Vec<f32> =
+            (0..24 * 80).map(|i| (((i / 80) as f64 - 11.5) / (80.0 * 0.58) / 0.5).max(0.01) as f32).collect();
+        let factor = |more: &[&str]| {
+            let args = args(more);
+            args.factor(&input, &road, size, args.camera(80.0, 24.0))
+        };
+        assert_eq!(factor(&[]).unwrap(), 1.0);
+        assert_eq!(factor(&["--scale", "2.5"]).unwrap(), 2.5);
+        assert_eq!(factor(&["--stereo"]).unwrap(), 5.4);
+        let found = factor(&["--camera-height", "1.65"]).unwrap();
+        assert!((found / 3.3 - 1.0).abs() < 0.01, "{found}");
+        // With a longer lens the same rows lie nearer to the horizon: the camera hangs lower.
+        let longer = factor(&["--camera-height", "1.65", "--intrinsics", "92.8,92.8,39.5,11.5"]).unwrap();
+        assert!((longer / 6.6 - 1.0).abs() < 0.02, "{longer}");
+        let nowhere = args(&["--camera-height", "1.65"]);
+        let error = nowhere.factor(&input, &vec![0.1; 24 * 80], size, nowhere.camera(80.0, 24.0)).unwrap_err();
+        assert!(error.to_string().contains("a.png: no road"), "{error}");
+    }
+
+    #[test]
+    fn the_camera_is_kittis_unless_given() {
+        let close = |a: Intrinsics, b: Intrinsics, by: f64| {
+            let pairs = [(a.fx, b.fx), (a.fy, b.fy), (a.cx, b.cx), (a.cy, b.cy)];
+            assert!(pairs.iter().all(|(a, b)| (a / b - 1.0).abs() < by), "{a:?} {b:?}");
+        };
+        // The published constants are those of KITTI's pictures, up to half a pixel.
+        close(args(&[]).camera(1242.0, 375.0), Intrinsics::KITTI, 4e-3);
+        close(args(&["--fov", "81.5"]).camera(640.0, 480.0), args(&[]).camera(640.0, 480.0), 1e-3);
+        let given = args(&["--intrinsics", "700,710,600,170"]).camera(1000.0, 500.0);
+        close(given, Intrinsics { fx: 0.7, fy: 1.42, cx: 0.6, cy: 0.34 }, 1e-12);
+    }
 }

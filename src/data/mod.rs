@@ -2,6 +2,7 @@
 
 pub mod augment;
 pub mod batch;
+pub mod inputs;
 pub mod kitti;
 pub mod picture;
 pub mod pyramid;

@@ -1,25 +1,30 @@
-//! Pictures from files: headers checked before anything is decoded, sizes bounded, messages with the path.
+//! Pictures from files (PNG, JPEG, WebP): headers checked before anything is decoded, sizes bounded, turned as their
+//! EXIF orientation says, messages with the path.
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::{Cursor, Read};
 use std::path::Path;
 
-use image::{DynamicImage, ImageError, ImageReader, RgbImage};
+use image::metadata::Orientation;
+use image::{DynamicImage, ImageDecoder, ImageError, ImageReader, RgbImage};
 
 use crate::{Error, Result};
 
 /// Pictures with more pixels are refused.
 pub const MAX_PIXELS: u64 = 100_000_000;
 
+/// Files with more bytes are not read: no picture of [`MAX_PIXELS`] needs so many.
+pub const MAX_BYTES: u64 = 1 << 30;
+
 /// A header lies within so many bytes, nearly always.
 const HEAD: u64 = 64 << 10;
 
-/// Reads the header alone: the width and height of a PNG or JPEG.
+/// Reads the header alone: width and height as they are stored, before any orientation is applied.
 ///
 /// # Errors
-/// If the file is missing, is no picture, is empty, or has more than 100 megapixels.
+/// If the file is missing, is no PNG, JPEG or WebP, is empty, or has more than 100 megapixels or a gigabyte.
 pub fn check_picture(path: &Path) -> Result<(u32, u32)> {
-    let file = File::open(path).map_err(|e| Error::io(path, e))?;
+    let file = open(path)?;
     let mut head = Vec::new();
     (&file).take(HEAD).read_to_end(&mut head).map_err(|e| Error::io(path, e))?;
     let dimensions = match dimensions(&head) {
@@ -31,6 +36,16 @@ pub fn check_picture(path: &Path) -> Result<(u32, u32)> {
         result => result,
     };
     check_size(path, dimensions.map_err(|e| undecodable(path, &e))?)
+}
+
+/// Opens a file that is not too large to be a picture.
+fn open(path: &Path) -> Result<File> {
+    let file = File::open(path).map_err(|e| Error::io(path, e))?;
+    let bytes = file.metadata().map_err(|e| Error::io(path, e))?.len();
+    if bytes > MAX_BYTES {
+        return Err(Error::file(path, format!("{bytes} bytes: pictures above 1 GiB are refused; make it smaller")));
+    }
+    Ok(file)
 }
 
 fn dimensions(bytes: &[u8]) -> Result<(u32, u32), ImageError> {
@@ -49,25 +64,38 @@ fn check_size(path: &Path, (width, height): (u32, u32)) -> Result<(u32, u32)> {
 }
 
 fn undecodable(path: &Path, error: &ImageError) -> Error {
-    Error::file(path, format!("expected a PNG or JPEG picture, could not decode it ({error}); restore the file"))
+    let message = format!("expected a PNG, JPEG or WebP picture, could not decode it ({error}); convert or restore it");
+    Error::file(path, message)
 }
 
-/// Decodes a PNG or JPEG, whatever its name ends in, with its own channels and bits.
+/// Decodes a PNG, JPEG or WebP, whatever its name ends in, with its own channels and bits, turned and mirrored as its
+/// EXIF orientation says. Of an animation the first frame.
+///
+/// # Errors
+/// As [`check_picture`], or if the pixels cannot be decoded.
 pub fn decode(path: &Path) -> Result<DynamicImage> {
-    let bytes = fs::read(path).map_err(|e| Error::io(path, e))?;
+    let mut bytes = Vec::new();
+    open(path)?.take(MAX_BYTES).read_to_end(&mut bytes).map_err(|e| Error::io(path, e))?;
     let size = dimensions(&bytes).map_err(|e| undecodable(path, &e))?;
     check_size(path, size)?;
     let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format().map_err(|e| Error::io(path, e))?;
-    reader.decode().map_err(|e| undecodable(path, &e))
+    let mut decoder = reader.into_decoder().map_err(|e| undecodable(path, &e))?;
+    // Metadata that cannot be read is no reason to refuse a picture.
+    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    let mut picture = DynamicImage::from_decoder(decoder).map_err(|e| undecodable(path, &e))?;
+    picture.apply_orientation(orientation);
+    Ok(picture)
 }
 
-/// Decodes a PNG or JPEG as 8-bit RGB.
+/// [`decode`] as 8-bit RGB: grey in all three channels, 16 bits rounded to 8, alpha left out, CMYK as its inks look.
 pub fn read_picture(path: &Path) -> Result<RgbImage> {
     decode(path).map(DynamicImage::into_rgb8)
 }
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     /// A PNG's signature and header chunk with any size, followed by nothing.
@@ -136,5 +164,128 @@ mod tests {
         let path = folder.path().join("g.png");
         image::GrayImage::from_pixel(4, 4, image::Luma([77])).save(&path).unwrap();
         assert_eq!(read_picture(&path).unwrap().get_pixel(1, 1).0, [77, 77, 77]);
+    }
+
+    /// The bytes of a picture in a format.
+    fn encoded(picture: &DynamicImage, format: image::ImageFormat) -> Vec<u8> {
+        let mut bytes = Cursor::new(Vec::new());
+        picture.write_to(&mut bytes, format).unwrap();
+        bytes.into_inner()
+    }
+
+    fn reread(name: &str, bytes: &[u8]) -> RgbImage {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(name);
+        fs::write(&path, bytes).unwrap();
+        read_picture(&path).unwrap()
+    }
+
+    /// 3x2, every pixel another: no turn and no mirror maps it onto itself.
+    fn six() -> RgbImage {
+        RgbImage::from_fn(3, 2, |x, y| image::Rgb([40 * x as u8, 90 * y as u8, 10]))
+    }
+
+    #[test]
+    fn every_kind_of_png_becomes_8_bit_rgb() {
+        let plain = DynamicImage::from(six());
+        let grey = RgbImage::from_fn(3, 2, |x, y| image::Rgb([plain.to_luma8().get_pixel(x, y)[0]; 3]));
+        for (kind, picture, expected) in [
+            ("rgb16", DynamicImage::from(plain.to_rgb16()), six()),
+            ("rgba8", DynamicImage::from(plain.to_rgba8()), six()),
+            ("rgba16", DynamicImage::from(plain.to_rgba16()), six()),
+            ("grey8", DynamicImage::from(plain.to_luma8()), grey.clone()),
+            ("grey16", DynamicImage::from(plain.to_luma8()).to_luma16().into(), grey.clone()),
+            ("grey with alpha", DynamicImage::from(plain.to_luma8()).to_luma_alpha8().into(), grey),
+        ] {
+            assert_eq!(reread("a.png", &encoded(&picture, image::ImageFormat::Png)), expected, "{kind}");
+        }
+        // What is transparent keeps its colour.
+        let mut clear = plain.to_rgba8();
+        clear.pixels_mut().for_each(|p| p[3] = 0);
+        assert_eq!(reread("a.png", &encoded(&clear.into(), image::ImageFormat::Png)), six());
+    }
+
+    #[test]
+    fn webp_is_read_whatever_its_name() {
+        let bytes = encoded(&six().into(), image::ImageFormat::WebP);
+        assert_eq!(reread("a.webp", &bytes), six());
+        assert_eq!(reread("misnamed.png", &bytes), six());
+    }
+
+    #[test]
+    fn exif_orientation_of_a_webp_is_applied() {
+        use image::ImageEncoder;
+        let mut bytes = Vec::new();
+        let mut encoder = image::codecs::webp::WebPEncoder::new_lossless(&mut bytes);
+        // Little-endian TIFF with one entry: orientation (0x112), one short: 6, a quarter turn clockwise.
+        let exif = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0";
+        encoder.set_exif_metadata(exif.to_vec()).unwrap();
+        encoder.write_image(six().as_raw(), 3, 2, image::ExtendedColorType::Rgb8).unwrap();
+        assert_eq!(reread("a.webp", &bytes), image::imageops::rotate90(&six()));
+    }
+
+    /// A baseline JPEG of one block of a single colour in four channels, as Adobe's programs write CMYK: 255 is no ink.
+    fn cmyk_jpeg(inks: [u8; 4]) -> Vec<u8> {
+        let mut bytes = b"\xff\xd8\xff\xee\0\x0eAdobe\0\x64\0\0\0\0\0".to_vec();
+        // Quantisation by 8: the mean of a block is its first coefficient.
+        bytes.extend(b"\xff\xdb\0\x43\0");
+        bytes.extend([8; 64]);
+        bytes.extend(b"\xff\xc0\0\x14\x08\0\x08\0\x08\x04");
+        (1..=4).for_each(|channel| bytes.extend([channel, 0x11, 0]));
+        // Means: nine lengths, of four bits each. The rest of a block: its end alone, in one bit.
+        bytes.extend(b"\xff\xc4\0\x1c\0\0\0\0\x09\0\0\0\0\0\0\0\0\0\0\0\0\0\x01\x02\x03\x04\x05\x06\x07\x08");
+        bytes.extend(b"\xff\xc4\0\x14\x10\x01\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0");
+        bytes.extend(b"\xff\xda\0\x0e\x04\x01\0\x02\0\x03\0\x04\0\0\x3f\0");
+        let mut bits = String::new();
+        for ink in inks {
+            let mean = i32::from(ink) - 128;
+            let length = (32 - mean.unsigned_abs().leading_zeros()) as usize;
+            let coded = if mean < 0 { mean + (1 << length) - 1 } else { mean };
+            bits += &format!("{length:04b}");
+            if length > 0 {
+                bits += &format!("{coded:0length$b}");
+            }
+            bits += "0";
+        }
+        while !bits.len().is_multiple_of(8) {
+            bits += "1";
+        }
+        for byte in bits.as_bytes().chunks(8) {
+            let byte = u8::from_str_radix(std::str::from_utf8(byte).unwrap(), 2).unwrap();
+            bytes.push(byte);
+            if byte == 0xff {
+                bytes.push(0);
+            }
+        }
+        bytes.extend(b"\xff\xd9");
+        bytes
+    }
+
+    #[test]
+    fn cmyk_looks_as_its_inks_do() {
+        for (inks, looks) in [([200, 100, 50, 255], [200, 100, 50]), ([200, 100, 50, 128], [100, 50, 25])] {
+            let pixel = reread("a.jpg", &cmyk_jpeg(inks)).get_pixel(4, 4).0;
+            assert!(pixel.iter().zip(looks).all(|(a, b)| a.abs_diff(b) < 3), "{inks:?}: {pixel:?}");
+        }
+    }
+
+    #[test]
+    fn a_format_of_another_kind_is_refused_with_advice() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.gif");
+        fs::write(&path, b"GIF89a\x01\0\x01\0\0\0\0;").unwrap();
+        let error = read_picture(&path).unwrap_err().to_string();
+        assert!(error.contains("a.gif") && error.contains("Gif") && error.contains("convert"), "{error}");
+    }
+
+    #[test]
+    fn a_file_of_gigabytes_is_not_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("huge.png");
+        // A hole: it takes no room on the disk.
+        File::create(&path).unwrap().set_len(MAX_BYTES + 1).unwrap();
+        for error in [check_picture(&path).unwrap_err(), read_picture(&path).unwrap_err()] {
+            assert!(error.to_string().contains("1 GiB"), "{error}");
+        }
     }
 }

@@ -1,5 +1,6 @@
 //! MonoViT (Zhao et al., 3DV 2022, 2208.03543): self-supervised monocular depth, as the paper tells it.
 
+pub mod camera_height;
 pub mod config;
 pub mod decoder;
 pub mod encoder;

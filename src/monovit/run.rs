@@ -22,7 +22,7 @@ use super::trainer::{OptimConfig, StepReport, Trainer};
 use crate::data::Dataset;
 use crate::data::batch::{Augment, Batch, Loader, batch_of_step};
 use crate::error::{Error, Result};
-use crate::files::write_bytes_atomically;
+use crate::files::{check_writable, write_bytes_atomically};
 use crate::nn::{Params, checkpoint};
 use crate::optim::{Decay, Schedule};
 use crate::report::colormap::disparity_to_image;
@@ -262,9 +262,7 @@ impl Run {
             let message = "is not empty: give another folder with --out, or go on with --resume";
             return Err(Error::file(folder, message));
         }
-        let probe = folder.join(".writable");
-        write_bytes_atomically(&probe, b"")?;
-        fs::remove_file(&probe).map_err(|e| Error::io(probe, e))
+        check_writable(folder)
     }
 
     /// A new run in an empty or missing folder.

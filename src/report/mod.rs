@@ -1,5 +1,6 @@
-//! Colour maps, plots, and what a run leaves behind.
+//! Colour maps, depth PNG, NumPy arrays, point clouds: what is made of depth and left behind as files.
 
 pub mod colormap;
 pub mod depth_png;
 pub mod npy;
+pub mod ply;
