@@ -9,7 +9,7 @@ use parallax::data::resize::lanczos;
 use parallax::files::write_bytes_atomically;
 use parallax::monovit::evaluation::Predictor;
 use parallax::monovit::metrics::resize_bilinear;
-use parallax::monovit::run::load_weights;
+use parallax::monovit::weights::Weights;
 use parallax::report::colormap::disparity_to_image;
 use parallax::report::depth_png::write_depth_png;
 use parallax::report::npy::write_npy;
@@ -19,9 +19,8 @@ use super::progress::Progress;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Weights, or a run's folder (its best weights).
-    #[arg(long, value_name = "FILE|RUN")]
-    weights: PathBuf,
+    #[command(flatten)]
+    weights: super::weights::Args,
     /// Pictures (PNG, JPEG), or folders of them.
     #[arg(required = true, value_name = "INPUT")]
     inputs: Vec<PathBuf>,
@@ -46,7 +45,7 @@ pub fn run(args: Args) -> Result<()> {
     if !(args.scale > 0.0 && args.scale.is_finite()) {
         return Err(Error::setting("--scale", format!("{} is not a number above 0", args.scale)));
     }
-    let (model, params, config) = load_weights(&args.weights)?;
+    let Weights { model, params, config, .. } = args.weights.load()?;
     let pictures = pictures(&args.inputs)?;
     let predictor = Predictor::new(&model, &params, &config.loss);
     let mut progress = Progress::new("pictures", pictures.len() as u64);

@@ -17,14 +17,15 @@ use zip::CompressionMethod;
 use zip::read::{ArchiveOffset, Config, ZipArchive};
 use zip::result::ZipError;
 
-use super::state::{Format, State, Storage};
+use super::state::{Format, State};
 use super::{MAX_DIRECTORY, MAX_INFLATION, MAX_PICKLE, PthError, SMALL, pickle, shown};
+use crate::nn::stored::Storage;
 
 /// PyTorch itself refuses what is newer.
 const NEWEST_VERSION: u32 = 10;
 
 /// An error unless the archive has a table of contents, of which no more than that is read.
-pub(super) fn check(file: impl Read + Seek) -> Result<(), PthError> {
+pub(in crate::nn) fn check(file: impl Read + Seek) -> Result<(), PthError> {
     open(file).map(|_| ())
 }
 
@@ -109,12 +110,12 @@ pub(super) fn read(bytes: Vec<u8>) -> Result<State, PthError> {
 
 /// How long an entry has to be.
 #[derive(Clone, Copy)]
-enum Expected {
+pub(in crate::nn) enum Expected {
     Exactly(u64),
     AtMost(u64),
 }
 
-struct Archive<'b> {
+pub(in crate::nn) struct Archive<'b> {
     zip: ZipArchive<Limited<Cursor<&'b [u8]>>>,
     bytes: &'b Arc<Vec<u8>>,
     /// The bytes of entries that may still be read. Entries could overlap, and so be more than the file.
@@ -124,10 +125,15 @@ struct Archive<'b> {
 }
 
 impl<'b> Archive<'b> {
-    fn open(bytes: &'b Arc<Vec<u8>>) -> Result<Self, PthError> {
+    pub(in crate::nn) fn open(bytes: &'b Arc<Vec<u8>>) -> Result<Self, PthError> {
         let zip = open(Cursor::new(bytes.as_slice()))?;
         let size = bytes.len() as u64;
         Ok(Archive { zip, bytes, stored_left: size, inflated_left: size.saturating_mul(MAX_INFLATION) + SMALL })
+    }
+
+    /// The entries' names, as far as they are UTF-8.
+    pub(in crate::nn) fn names(&self) -> Vec<String> {
+        self.zip.file_names().filter_map(|name| Some(name.ok()?.to_owned())).collect()
     }
 
     fn has(&self, name: &str) -> bool {
@@ -178,7 +184,7 @@ impl<'b> Archive<'b> {
     }
 
     /// An entry's bytes: a part of the file if it is stored as it is, unpacked otherwise. Its checksum is compared.
-    fn take(&mut self, name: &str, expected: Expected) -> Result<Storage, PthError> {
+    pub(in crate::nn) fn take(&mut self, name: &str, expected: Expected) -> Result<Storage, PthError> {
         let Some(index) = self.zip.index_for_name(name) else {
             return Err(PthError::damaged(format!("the entry `{}` is missing", shown(name))));
         };

@@ -2,8 +2,9 @@
 
 use super::globals::Global;
 use super::pickle::{Object, Pickle, Value, View};
-use super::state::{Budget, Format, Item, Plain, State, Storage, Tensor};
+use super::state::{Budget, Format, Item, Plain, State};
 use super::{MAX_DEPTH, MAX_TEXT, MAX_VALUES, PthError, shown};
+use crate::nn::stored::{Storage, StoredTensor};
 
 type Result<T> = std::result::Result<T, PthError>;
 
@@ -136,12 +137,13 @@ impl<'a> Flat<'_, 'a> {
         Ok(())
     }
 
-    fn tensor(&mut self, path: &str, view: &View) -> Result<Tensor> {
+    fn tensor(&mut self, path: &str, view: &View) -> Result<StoredTensor> {
         let (Some(storage), Some(claim)) = (self.storages.get(view.storage), self.pickle.storages.get(view.storage))
         else {
             return Err(PthError::Tensor { name: shown(path), message: "it has no storage".into() });
         };
-        let tensor = Tensor::new(storage.clone(), claim.dtype, view.offset, view.shape.clone(), view.strides.clone());
+        let (shape, strides) = (view.shape.clone(), view.strides.clone());
+        let tensor = StoredTensor::new(storage.clone(), claim.dtype, view.offset, shape, strides);
         self.budget.add(path, &tensor)?;
         Ok(tensor)
     }

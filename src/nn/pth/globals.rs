@@ -1,7 +1,7 @@
 //! The allow-list: every Python name a pickle may mention. Each stands for something that is made here; none is run.
 
-use super::state::Dtype;
 use super::{PthError, shown};
+use crate::nn::stored::Dtype;
 
 /// Every name a pickle may mention, and what it stands for here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

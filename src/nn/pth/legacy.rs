@@ -7,8 +7,9 @@ use std::sync::Arc;
 
 use super::archive::big_endian;
 use super::pickle::{self, Pickle, Value};
-use super::state::{Format, State, Storage};
+use super::state::{Format, State};
 use super::{PthError, shown};
+use crate::nn::stored::Storage;
 
 const MAGIC: i128 = 0x1950_a86a_20f9_469c_fc6c;
 const PROTOCOL: i128 = 1001;

@@ -12,7 +12,7 @@
 //! Everything in a file is a claim until it has been checked against the bytes that are there: memory and time are
 //! bounded by the file's size and by the constants below, and no input makes the reader panic.
 
-mod archive;
+pub(in crate::nn) mod archive;
 mod flatten;
 mod globals;
 mod legacy;
@@ -23,12 +23,14 @@ mod write;
 #[cfg(test)]
 mod tests;
 
-pub use state::{Dtype, Format, Item, Plain, State, Tensor};
+pub use state::{Format, Item, Plain, State};
 pub use write::{Saved, to_bytes, write};
 
 use std::fs::File;
 use std::io::{self, BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
+
+use crate::error::Error;
 
 /// The largest checkpoint that is read at all, in bytes. 100 million weights with the two moments of AdamW take 1.2 GB.
 pub const MAX_FILE: u64 = 2 << 30;
@@ -95,6 +97,14 @@ pub enum PthError {
 }
 
 impl PthError {
+    /// The same as this crate's error, which names the file.
+    pub fn in_file(self, path: impl AsRef<Path>) -> Error {
+        match self {
+            PthError::Io(source) => Error::io(path, source),
+            other => Error::file(path, other.to_string()),
+        }
+    }
+
     fn truncated(what: impl Into<String>) -> Self {
         PthError::Truncated(what.into())
     }
@@ -162,7 +172,7 @@ fn recognise(head: &[u8]) -> Result<Format, PthError> {
 }
 
 /// A name from the file as it may be printed: no control characters, and not too long.
-fn shown(text: &str) -> String {
+pub(crate) fn shown(text: &str) -> String {
     let mut out: String = text.chars().take(100).flat_map(char::escape_debug).collect();
     if text.chars().nth(100).is_some() {
         out += "...";

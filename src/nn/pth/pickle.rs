@@ -7,8 +7,8 @@
 use std::collections::HashMap;
 
 use super::globals::{Global, global};
-use super::state::Dtype;
 use super::{MAX_INSTRUCTIONS, MAX_PICKLE, MAX_RANK, PthError, shown};
+use crate::nn::stored::Dtype;
 
 type Result<T> = std::result::Result<T, PthError>;
 
