@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 use std::fs::File;
-use std::io::{self, BufReader, Read, Seek, SeekFrom, Write};
+use std::io::{self, BufReader, BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -27,7 +27,7 @@ const MAX_RANK: usize = 16;
 pub fn write(path: &Path, arrays: &[(&str, &[usize], &[f32])], integers: &[(&str, i64)]) -> Result<()> {
     write_atomically(path, |out| {
         let mut zip = ZipWriter::new(out);
-        let mut start = |zip: &mut ZipWriter<_>, name: &str, bytes: usize| {
+        let start = |zip: &mut ZipWriter<&mut BufWriter<File>>, name: &str, bytes: usize| {
             let options = SimpleFileOptions::default()
                 .compression_method(CompressionMethod::Stored)
                 .last_modified_time(DateTime::default())
@@ -99,7 +99,7 @@ pub fn open(path: &Path) -> Result<TensorFile> {
 /// An array from the bytes of a `.npy` file (version 1, 2 or 3).
 fn read_array(file: Storage) -> Result<StoredTensor, String> {
     let bytes = file.bytes.get(file.range.clone()).unwrap_or(&[]);
-    let (fixed, length) = match bytes {
+    let (fixed, length): (usize, usize) = match bytes {
         [0x93, b'N', b'U', b'M', b'P', b'Y', 1, _, a, b, ..] => (10, usize::from(u16::from_le_bytes([*a, *b]))),
         [0x93, b'N', b'U', b'M', b'P', b'Y', 2 | 3, _, a, b, c, d, ..] => {
             (12, u32::from_le_bytes([*a, *b, *c, *d]) as usize)

@@ -110,7 +110,7 @@ impl StoredTensor {
         if range.end > bytes.len() || range.end.checked_sub(range.start)? != needed {
             return None;
         }
-        let mut strides = vec![1; shape.len()];
+        let mut strides = vec![1_usize; shape.len()];
         for axis in (1..shape.len()).rev() {
             strides[axis - 1] = strides[axis].saturating_mul(shape[axis].max(1));
         }

@@ -50,7 +50,9 @@ impl Sizes {
             ["mhca_stages", _, "mhca_blks", _, "MHCA_layers", _, "mlp", "fc1", "weight"] => {
                 if let (Some(stage @ 0..4), Some(layer @ 0..1024)) = (at(1), at(5)) {
                     larger(&mut self.layers[stage], layer + 1);
-                    if let &[hidden, channels @ 1..] = shape {
+                    if let &[hidden, channels] = shape
+                        && channels > 0
+                    {
                         self.mlp_ratio = Some(hidden / channels);
                     }
                 }

@@ -199,7 +199,7 @@ impl Sources {
     /// If the tensors are not exactly those of the networks that are needed, or there at all; in any case if none fits,
     /// if one is not finite, or if two for one parameter differ. Nothing is changed then.
     pub fn fill(&self, params: &mut Params<f32>, need: Need, allow_partial: bool) -> Result<Report> {
-        let network = |name: &str| NETWORKS.into_iter().find(|n| name.split('.').next() == Some(n));
+        let network = |name: &str| NETWORKS.into_iter().find(|n| name.split('.').next() == Some(*n));
         let mut skipped = self.skipped.clone();
         let mut unexpected = self.unexpected.clone();
         let mut tensors = self.tensors.clone();

@@ -133,7 +133,7 @@ impl<'b> Archive<'b> {
 
     /// The entries' names, as far as they are UTF-8.
     pub(in crate::nn) fn names(&self) -> Vec<String> {
-        self.zip.file_names().filter_map(|name| Some(name.ok()?.to_owned())).collect()
+        self.zip.file_names().filter_map(|name| Some(name.ok()?.into_owned())).collect()
     }
 
     fn has(&self, name: &str) -> bool {
