@@ -15,7 +15,7 @@ use super::progress::Progress;
 #[derive(clap::Args)]
 pub struct Args {
     #[command(flatten)]
-    weights: super::weights::Args,
+    weights: super::weights::WeightsArgs,
     /// What to measure on: `street` (of a seed that no run trains on) or a folder in the layout of KITTI raw.
     #[arg(long, value_name = "street|DIR", default_value = "street")]
     data: String,

@@ -20,7 +20,7 @@ use super::progress::Progress;
 #[derive(clap::Args)]
 pub struct Args {
     #[command(flatten)]
-    weights: super::weights::Args,
+    weights: super::weights::WeightsArgs,
     /// Pictures (PNG, JPEG), or folders of them.
     #[arg(required = true, value_name = "INPUT")]
     inputs: Vec<PathBuf>,

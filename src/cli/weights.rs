@@ -7,7 +7,7 @@ use parallax::monovit::run::check_size;
 use parallax::monovit::weights::{self, Need, Weights};
 
 #[derive(clap::Args)]
-pub struct Args {
+pub struct WeightsArgs {
     /// Weights: a run's folder (its best weights), a file (.safetensors, .pth, .npz), or a folder with encoder.pth,
     /// depth.pth, ...; several times for several files.
     #[arg(long, value_name = "FILE|DIR", required = true)]
@@ -23,7 +23,7 @@ pub struct Args {
     width: Option<usize>,
 }
 
-impl Args {
+impl WeightsArgs {
     /// The weights that were asked for, to predict depth with.
     pub fn load(&self) -> Result<Weights> {
         self.check()?;
