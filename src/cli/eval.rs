@@ -8,15 +8,14 @@ use parallax::data::kitti::{DepthAxis, GroundTruth, Kitti, Options};
 use parallax::data::street::{Street, StreetConfig};
 use parallax::monovit::evaluation::{Evaluation, Predictor, evaluate};
 use parallax::monovit::metrics::{Protocol, Scale};
-use parallax::monovit::run::load_weights;
+use parallax::monovit::weights::Weights;
 
 use super::progress::Progress;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Weights, or a run's folder (its best weights).
-    #[arg(long, value_name = "FILE|RUN")]
-    weights: PathBuf,
+    #[command(flatten)]
+    weights: super::weights::WeightsArgs,
     /// What to measure on: `street` (of a seed that no run trains on) or a folder in the layout of KITTI raw.
     #[arg(long, value_name = "street|DIR", default_value = "street")]
     data: String,
@@ -41,7 +40,7 @@ pub struct Args {
 }
 
 pub fn run(args: Args) -> Result<()> {
-    let (model, params, config) = load_weights(&args.weights)?;
+    let Weights { model, params, config, .. } = args.weights.load()?;
     let (height, width) = (config.height, config.width);
     let data: Box<dyn Dataset> = if args.data == "street" {
         let street = StreetConfig { height, width, sequences: 8, seed: args.seed, ..StreetConfig::default() };

@@ -1,6 +1,7 @@
 //! The command line: arguments in, library calls, tables and JSON out. Exit status 0 done, 1 failed, 2 wrong usage.
 
 mod bench;
+mod convert;
 mod data;
 mod eval;
 mod gradcheck;
@@ -9,6 +10,7 @@ mod predict;
 mod progress;
 mod sizes;
 mod train;
+mod weights;
 
 use std::process::ExitCode;
 
@@ -34,6 +36,8 @@ enum Command {
     Eval(eval::Args),
     /// Turn pictures into depth maps.
     Predict(predict::Args),
+    /// Turn weights into another kind of file: PyTorch's .pth, safetensors, NumPy's .npz.
+    Convert(convert::Args),
     /// Check every op's gradient against finite differences, now, on this machine.
     Gradcheck(gradcheck::Args),
     /// Time a training step or an inference, op by op.
@@ -51,6 +55,7 @@ pub fn main() -> ExitCode {
         Command::Train(args) => train::run(args),
         Command::Eval(args) => eval::run(args),
         Command::Predict(args) => predict::run(args),
+        Command::Convert(args) => convert::run(args),
         Command::Gradcheck(args) => gradcheck::run(args),
         Command::Bench(args) => bench::run(args),
         Command::Info(args) => info::run(args),

@@ -12,7 +12,7 @@ use parallax::files::{check_writable, write_bytes_atomically};
 use parallax::monovit::camera_height::find_ground;
 use parallax::monovit::evaluation::Predictor;
 use parallax::monovit::metrics::{STEREO_SCALE, median, resize_bilinear};
-use parallax::monovit::run::{check_size, load_weights};
+use parallax::monovit::weights::Weights;
 use parallax::report::colormap::disparity_to_image;
 use parallax::report::depth_png::write_depth_png;
 use parallax::report::npy::write_npy;
@@ -29,9 +29,8 @@ use outputs::{Job, Outputs, jobs};
 #[derive(clap::Args)]
 #[command(after_long_help = AFTER)]
 pub struct Args {
-    /// Weights, or a run's folder (its best weights).
-    #[arg(long, value_name = "FILE|RUN")]
-    weights: PathBuf,
+    #[command(flatten)]
+    weights: super::weights::WeightsArgs,
     /// Pictures (PNG, JPEG, WebP), or folders of them.
     ///
     /// Of a folder everything below it, frame2 before frame10; hidden files and links to folders are
@@ -67,12 +66,6 @@ pub struct Args {
     /// Predict on the mirrored picture too, and join both: twice the time, better borders.
     #[arg(long, help_heading = "Network")]
     flip: bool,
-    /// Height of the network's pictures, a multiple of 32; that of its training unless given.
-    #[arg(long, value_name = "PIXELS", help_heading = "Network")]
-    height: Option<usize>,
-    /// Their width, likewise.
-    #[arg(long, value_name = "PIXELS", help_heading = "Network")]
-    width: Option<usize>,
     /// Depths are multiplied by this; 1 unless given.
     #[arg(long, value_name = "FACTOR", group = "unit", help_heading = "Scale (one of)", value_parser = above_zero)]
     scale: Option<f64>,
@@ -168,14 +161,11 @@ struct Failure {
 
 pub fn run(args: Args) -> Result<()> {
     let started = Instant::now();
-    for (name, size) in [("--height", args.height), ("--width", args.width)] {
-        size.map_or(Ok(()), |size| check_size(name, size))?;
-    }
     let jobs = jobs(find_pictures(&args.inputs, &args.out)?, &args)?;
-    let (model, params, config) = load_weights(&args.weights)?;
+    let Weights { model, params, config, .. } = args.weights.load()?;
     check_writable(&args.out)?;
     let predictor = Predictor::new(&model, &params, &config.loss);
-    let size = (args.height.unwrap_or(config.height), args.width.unwrap_or(config.width));
+    let size = (config.height, config.width);
     let mut progress = Progress::new("pictures", jobs.len() as u64);
     let (mut done, mut failed) = (Vec::new(), Vec::new());
     for (i, job) in jobs.into_iter().enumerate() {
@@ -199,7 +189,7 @@ pub fn run(args: Args) -> Result<()> {
     }
     let (all, failures) = (done.len() + failed.len(), failed.len());
     if args.json {
-        let (weights, seconds) = (args.weights.to_string_lossy().into_owned(), started.elapsed().as_secs_f64());
+        let (weights, seconds) = (args.weights.name(), started.elapsed().as_secs_f64());
         super::print_json(&Summary { weights, height: size.0, width: size.1, pictures: done, failed, seconds })?;
     }
     match failures {

@@ -10,6 +10,8 @@ use parallax::data::{Dataset, Subset};
 use parallax::monovit::Preset;
 use parallax::monovit::metrics::Metrics;
 use parallax::monovit::run::{Ended, Event, Run, RunConfig, RunData, RunMetrics, read_config};
+use parallax::monovit::start::Start;
+use parallax::monovit::weights::preset_of;
 use parallax::{Error, Result};
 
 use super::progress::Progress;
@@ -55,11 +57,21 @@ pub struct Args {
     /// A configuration such as a run's config.toml; flags win over it.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Weights to start from.
-    #[arg(long, value_name = "WEIGHTS")]
-    init: Option<PathBuf>,
+    /// Weights to start from, all four networks: a run, a file, a folder with encoder.pth, depth.pth, ...; several times
+    /// for several files. The preset is that of the weights.
+    #[arg(long, value_name = "FILE|DIR")]
+    init: Vec<PathBuf>,
+    /// Start the depth encoder from an MPViT that was trained on ImageNet.
+    #[arg(long, value_name = "FILE")]
+    init_encoder: Option<PathBuf>,
+    /// Start the pose encoder from a ResNet-18 that was trained on ImageNet (torchvision's).
+    #[arg(long, value_name = "FILE")]
+    init_pose: Option<PathBuf>,
+    /// Start from those weights that fit; the others are listed.
+    #[arg(long)]
+    allow_partial: bool,
     /// Go on with an interrupted run.
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "config", "init", "data", "split", "preset"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "config", "init", "init_encoder", "init_pose", "data", "split", "preset"])]
     resume: Option<PathBuf>,
     /// The run's folder, new or empty.
     #[arg(long, value_name = "RUN")]
@@ -90,6 +102,15 @@ pub fn run(args: Args) -> Result<()> {
         None => {
             let mut config = configuration(&args)?;
             config.check()?;
+            // Weights that do not fit are found out before anything is rendered or made.
+            let start = Start::of(&config)?;
+            for (files, report) in &start.reports {
+                let files: Vec<String> = files.iter().map(|f| f.display().to_string()).collect();
+                eprintln!("starting from {}", files.join(", "));
+                if report.problem().is_some() {
+                    eprintln!("{report}");
+                }
+            }
             let folder = args.out.clone().unwrap_or_else(|| next_free("runs"));
             let made = !folder.exists();
             Run::claim(&folder)?;
@@ -99,7 +120,7 @@ pub fn run(args: Args) -> Result<()> {
                     let a_pass = data.train.len().div_ceil(config.batch.max(1)) as u64;
                     config.set_steps(epochs * a_pass);
                 }
-                Ok((Run::create(&folder, config)?, data))
+                Ok((Run::create_from(&folder, config, start)?, data))
             });
             prepared.inspect_err(|_| {
                 // A folder made for nothing; if it cannot go, the error above says what matters.
@@ -184,17 +205,26 @@ fn print_metrics(m: &RunMetrics) {
 fn configuration(args: &Args) -> Result<RunConfig> {
     let mut c = match &args.config {
         Some(path) => read_config(path)?,
-        None => RunConfig::new(args.preset.unwrap_or(Preset::Nano), STEPS),
+        None => RunConfig::new(preset(args)?, STEPS),
     };
     macro_rules! take {
         ($($field:ident),*) => {$(if let Some(value) = args.$field.clone() { c.$field = value; })*};
     }
     take!(data, preset, height, width, batch, seed);
-    for (to, from) in [(&mut c.split, &args.split), (&mut c.val_split, &args.val_split), (&mut c.init, &args.init)] {
+    for (to, from) in [
+        (&mut c.split, &args.split),
+        (&mut c.val_split, &args.val_split),
+        (&mut c.init_encoder, &args.init_encoder),
+        (&mut c.init_pose, &args.init_pose),
+    ] {
         if from.is_some() {
             *to = from.clone();
         }
     }
+    if !args.init.is_empty() {
+        c.init.clone_from(&args.init);
+    }
+    c.allow_partial |= args.allow_partial;
     if let Some(rate) = args.learning_rate {
         if !(rate > 0.0 && rate.is_finite()) {
             return Err(Error::setting("--learning-rate", format!("{rate} is not a number above 0")));
@@ -208,6 +238,16 @@ fn configuration(args: &Args) -> Result<RunConfig> {
         c.set_steps(steps);
     }
     Ok(c)
+}
+
+/// The preset that was asked for; without, that of the weights to start from; without those, the reduced one.
+fn preset(args: &Args) -> Result<Preset> {
+    let files: Vec<PathBuf> = args.init.iter().chain(&args.init_encoder).cloned().collect();
+    match args.preset {
+        Some(preset) => Ok(preset),
+        None if files.is_empty() => Ok(Preset::Nano),
+        None => preset_of(&files),
+    }
 }
 
 /// `runs/1`, `runs/2`, ...: the first that is not there.

@@ -11,7 +11,9 @@ mod model;
 pub mod pose;
 pub mod run;
 pub mod shake;
+pub mod start;
 pub mod trainer;
+pub mod weights;
 
 pub use config::{Config, Preset};
 pub use model::MonoVit;

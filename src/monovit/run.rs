@@ -18,7 +18,9 @@ use super::loss::LossConfig;
 use super::metrics::{MeanMap, Metrics, Protocol, Scale};
 use super::model::MonoVit;
 use super::shake::Shake;
+use super::start::Start;
 use super::trainer::{OptimConfig, StepReport, Trainer};
+use super::weights::{self, Need, Weights};
 use crate::data::Dataset;
 use crate::data::batch::{Augment, Batch, Loader, batch_of_step};
 use crate::error::{Error, Result};
@@ -50,8 +52,18 @@ pub struct RunConfig {
     /// A split list for a folder: every second frame validates, the others (with ground truth) are reported on. Every
     /// tenth training frame is set aside, without.
     pub val_split: Option<PathBuf>,
-    /// Weights to start from.
-    pub init: Option<PathBuf>,
+    /// Weights to start from: files or folders, all four networks together.
+    #[serde(default, deserialize_with = "none_one_or_many", skip_serializing_if = "Vec::is_empty")]
+    pub init: Vec<PathBuf>,
+    /// Weights that the depth encoder starts from alone: an MPViT trained on ImageNet.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub init_encoder: Option<PathBuf>,
+    /// Weights that the pose encoder starts from alone: a ResNet-18 trained on ImageNet.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub init_pose: Option<PathBuf>,
+    /// Whether to start from those of the weights that fit, when not all do.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub allow_partial: bool,
     /// The disparity (sigmoid, in (0, 1)) that an untrained network predicts: the biases of the four heads. Without, as
     /// they are drawn: about 1/2, which is so near that what is nearer still has no disparity left.
     pub initial_disparity: Option<f64>,
@@ -80,7 +92,10 @@ impl RunConfig {
             data: "street".into(),
             split: None,
             val_split: None,
-            init: None,
+            init: Vec::new(),
+            init_encoder: None,
+            init_pose: None,
+            allow_partial: false,
             initial_disparity: Some(0.15),
             log_every: 10,
             checkpoint_every: 200,
@@ -142,6 +157,27 @@ impl RunConfig {
         }
         Ok(())
     }
+
+    /// What a safetensors file says about itself: this configuration, as JSON under `parallax`.
+    pub fn metadata(&self) -> Result<HashMap<String, String>> {
+        let text = serde_json::to_string(self).map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
+        Ok(HashMap::from([("parallax".into(), text)]))
+    }
+}
+
+/// `init` may be nothing, one path, or a list.
+fn none_one_or_many<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Vec<PathBuf>, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged)]
+    enum Paths {
+        One(PathBuf),
+        Many(Vec<PathBuf>),
+    }
+    Ok(match Option::<Paths>::deserialize(deserializer)? {
+        None => Vec::new(),
+        Some(Paths::One(path)) => vec![path],
+        Some(Paths::Many(paths)) => paths,
+    })
 }
 
 /// Sides of pictures are multiples of 32, because the deepest map has a 32nd of them, and at least 64, because a map of
@@ -266,22 +302,23 @@ impl Run {
     }
 
     /// A new run in an empty or missing folder.
-    pub fn create(folder: &Path, mut config: RunConfig) -> Result<Self> {
+    pub fn create(folder: &Path, config: RunConfig) -> Result<Self> {
+        config.check()?;
+        let start = Start::of(&config)?;
+        Self::create_from(folder, config, start)
+    }
+
+    /// A new run whose starting weights are at hand.
+    pub fn create_from(folder: &Path, mut config: RunConfig, start: Start) -> Result<Self> {
         config.check()?;
         Self::claim(folder)?;
-        let (model, mut params) = MonoVit::new(config.model(), config.seed);
-        if let Some(disparity) = config.initial_disparity {
-            start_at(&mut params, disparity);
-        }
-        if let Some(init) = config.init.clone() {
-            // Weights that somebody trained know rotations already.
+        if start.knows_motion {
+            // Pose networks that somebody trained know rotations already.
             config.loss.shake.steps = 0;
-            let contents = checkpoint::read(&init)?;
-            checkpoint::import(&mut params, &contents.tensors, &init)?;
         }
         let text = toml::to_string(&config).map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
         write_bytes_atomically(folder.join("config.toml"), text.as_bytes())?;
-        let trainer = Trainer::of(model, params, config.optim, config.loss, config.seed);
+        let trainer = Trainer::of(start.model, start.params, config.optim, config.loss, config.seed);
         let run = Self::of(folder, config, trainer);
         run.save()?;
         Ok(run)
@@ -512,15 +549,6 @@ fn forty_of(len: usize) -> Vec<usize> {
     (0..len).step_by(len.div_ceil(40).max(1)).collect()
 }
 
-/// Sets the biases of the disparity heads so that an input of zeros gives this disparity.
-fn start_at(params: &mut Params<f32>, disparity: f64) {
-    let logit = (disparity / (1.0 - disparity)).ln() as f32;
-    for scale in 0..4 {
-        let head = params.find(&format!("depth.convs.dispconv{scale}.conv.bias")).expect("every size has four heads");
-        params.value_mut(head).data_mut().fill(logit);
-    }
-}
-
 /// Reads a run's (or anybody's) configuration.
 pub fn read_config(path: &Path) -> Result<RunConfig> {
     let text = fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
@@ -529,20 +557,11 @@ pub fn read_config(path: &Path) -> Result<RunConfig> {
 
 /// Writes weights for use: PyTorch's names and layouts, the configuration in the metadata.
 pub fn write_weights(path: &Path, params: &Params<f32>, config: &RunConfig) -> Result<()> {
-    let text = serde_json::to_string(config).map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
-    checkpoint::write(path, &checkpoint::export(params), HashMap::from([("parallax".into(), text)]))
+    checkpoint::write(path, &checkpoint::export(params), config.metadata()?)
 }
 
-/// Reads weights: a file written by [`write_weights`], or a run's folder, which means its `best.safetensors`.
+/// Reads weights to predict depth with: a run's folder, or a file or folder of any kind that [`weights::load`] reads.
 pub fn load_weights(path: &Path) -> Result<(MonoVit, Params<f32>, RunConfig)> {
-    let path = if path.is_dir() { path.join("best.safetensors") } else { path.to_owned() };
-    let contents = checkpoint::read::<f32>(&path)?;
-    let config = contents.metadata.get("parallax").ok_or_else(|| {
-        Error::file(&path, "holds no configuration of this program: was it written by `parallax train`?")
-    })?;
-    let config: RunConfig =
-        serde_json::from_str(config).map_err(|e| Error::file(&path, format!("its configuration: {e}")))?;
-    let (model, mut params) = MonoVit::new(config.model(), 0);
-    checkpoint::import(&mut params, &contents.tensors, &path)?;
+    let Weights { model, params, config, .. } = weights::load(&[path.to_owned()], Need::Depth, false)?;
     Ok((model, params, config))
 }

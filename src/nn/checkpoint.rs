@@ -1,13 +1,24 @@
 //! Checkpoints as safetensors, in PyTorch's names and layouts, so that one file serves both sides.
 
 use std::collections::{BTreeMap, HashMap};
+use std::fs::File;
+use std::io::Read;
 use std::path::Path;
+use std::sync::Arc;
 
-use safetensors::tensor::{Dtype, SafeTensors, TensorView, serialize};
+use safetensors::tensor::{Dtype, Metadata, TensorView, serialize};
 
 use super::params::Params;
+use super::pth::shown;
+use super::stored::{self, StoredTensor};
+use super::tensor_file::TensorFile;
 use crate::error::{Error, Result};
 use crate::tensor::{Float, Tensor};
+
+/// The largest file that is read, in bytes. The training state of the largest size has 2 GB.
+const MAX_FILE: u64 = 8 << 30;
+/// The longest header, in bytes. A tensor takes some 150.
+const MAX_HEADER: u64 = 8 << 20;
 
 /// The bytes of a checkpoint: every tensor under its own name, in PyTorch's layout, in f32, and `metadata`.
 pub fn to_bytes<T: Float>(tensors: &BTreeMap<String, Tensor<T>>, metadata: HashMap<String, String>) -> Result<Vec<u8>> {
@@ -40,6 +51,80 @@ pub fn export<T: Float>(params: &Params<T>) -> BTreeMap<String, Tensor<T>> {
     params.iter().map(|(_, p)| (p.name().to_owned(), p.layout.export(&p.value))).collect()
 }
 
+/// Opens a safetensors file.
+///
+/// # Errors
+/// If the header does not describe the file exactly: every tensor a range of the length that its shape needs, no two
+/// overlapping, nothing left over. Nothing larger than the header is read before that is known.
+pub fn open(path: &Path) -> Result<TensorFile> {
+    let io = |e| Error::io(path, e);
+    let not = |why: String| Error::file(path, format!("not a safetensors file: {why}"));
+    let mut file = File::open(path).map_err(io)?;
+    let size = file.metadata().map_err(io)?.len();
+    if size > MAX_FILE {
+        return Err(Error::file(path, format!("has {size} bytes (at most {MAX_FILE} are read)")));
+    }
+    let mut length = [0; 8];
+    if size < 8 {
+        return Err(not(format!("it has {size} bytes and no header")));
+    }
+    file.read_exact(&mut length).map_err(io)?;
+    let length = u64::from_le_bytes(length);
+    if length > size - 8 {
+        return Err(not(format!("its header claims {length} bytes, of a file of {size}")));
+    }
+    if length > MAX_HEADER {
+        return Err(Error::file(path, format!("its header has {length} bytes (at most {MAX_HEADER} are read)")));
+    }
+    let mut header = Vec::new();
+    (&mut file).take(length).read_to_end(&mut header).map_err(io)?;
+    let header: Metadata =
+        serde_json::from_slice(&header).map_err(|e| Error::file(path, format!("its safetensors header: {e}")))?;
+    let claimed = header.data_len() as u64;
+    let there = size - 8 - length;
+    if there < claimed {
+        let message = format!("is cut short: {there} bytes of numbers, expected {claimed}. Copy or download it again");
+        return Err(Error::file(path, message));
+    }
+    if there > claimed {
+        return Err(Error::file(path, format!("is damaged: {} bytes belong to no tensor", there - claimed)));
+    }
+    let mut bytes = Vec::with_capacity(usize::try_from(claimed).unwrap_or(0));
+    file.take(claimed).read_to_end(&mut bytes).map_err(io)?;
+    let bytes = Arc::new(bytes);
+
+    let mut tensors = Vec::new();
+    for name in header.offset_keys() {
+        let Some(info) = header.info(&name) else { continue };
+        let Some(dtype) = dtype(info.dtype) else {
+            let message = format!("{} holds {:?}, which cannot be read", shown(&name), info.dtype);
+            return Err(Error::file(path, message));
+        };
+        let range = info.data_offsets.0..info.data_offsets.1;
+        let tensor = StoredTensor::contiguous(&bytes, range, dtype, info.shape.clone())
+            .ok_or_else(|| Error::file(path, format!("is damaged: {} goes beyond its end", shown(&name))))?;
+        tensors.push((name, tensor));
+    }
+    let metadata = header.metadata().clone().unwrap_or_default();
+    Ok(TensorFile { path: path.to_owned(), tensors, integers: Vec::new(), metadata })
+}
+
+fn dtype(theirs: Dtype) -> Option<stored::Dtype> {
+    Some(match theirs {
+        Dtype::F64 => stored::Dtype::F64,
+        Dtype::F32 => stored::Dtype::F32,
+        Dtype::F16 => stored::Dtype::F16,
+        Dtype::BF16 => stored::Dtype::BF16,
+        Dtype::I64 => stored::Dtype::I64,
+        Dtype::I32 => stored::Dtype::I32,
+        Dtype::I16 => stored::Dtype::I16,
+        Dtype::I8 => stored::Dtype::I8,
+        Dtype::U8 => stored::Dtype::U8,
+        Dtype::BOOL => stored::Dtype::Bool,
+        _ => return None,
+    })
+}
+
 /// What a safetensors file holds.
 pub struct Contents<T: Float> {
     /// The tensors by name, in the file's layout.
@@ -48,73 +133,24 @@ pub struct Contents<T: Float> {
     pub metadata: HashMap<String, String>,
 }
 
-/// Reads a safetensors file (f32 or f64 tensors).
-pub fn read<T: Float>(path: &Path) -> Result<Contents<T>> {
-    let bytes = std::fs::read(path).map_err(|e| Error::io(path, e))?;
-    let not = |e| Error::file(path, format!("not a safetensors file: {e}"));
-    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(not)?;
-    let file = SafeTensors::deserialize(&bytes).map_err(not)?;
-    let mut tensors = HashMap::new();
-    for (name, view) in file.tensors() {
-        if view.shape().len() > crate::tensor::shape::MAX_RANK {
-            return Err(Error::file(
-                path,
-                format!("{name} has {} dimensions, more than a tensor can", view.shape().len()),
-            ));
-        }
-        let data = view.data();
-        let numbers: Vec<T> = match view.dtype() {
-            Dtype::F32 => data.as_chunks::<4>().0.iter().map(|b| T::of(f32::from_le_bytes(*b) as f64)).collect(),
-            Dtype::F64 => data.as_chunks::<8>().0.iter().map(|b| T::of(f64::from_le_bytes(*b))).collect(),
-            other => {
-                let message = format!("{name} holds {other:?}: only F32 and F64 can be read");
-                return Err(Error::file(path, message));
-            }
-        };
-        tensors.insert(name, Tensor::from_vec(view.shape(), numbers));
-    }
-    Ok(Contents { tensors, metadata: header.metadata().clone().unwrap_or_default() })
-}
-
-/// Puts tensors (in PyTorch's layout) into a model; every one of the model's must be there, and no other.
+/// Reads a whole safetensors file of floating-point tensors.
 ///
-/// A tensor may stand under any of its names. `num_batches_tracked` counters are passed over.
-pub fn import<T: Float>(params: &mut Params<T>, tensors: &HashMap<String, Tensor<T>>, path: &Path) -> Result<()> {
-    let mut missing = Vec::new();
-    let mut found = Vec::new();
-    for (id, p) in params.iter() {
-        let Some(theirs) = p.names.iter().find_map(|n| tensors.get(n)) else {
-            missing.push(p.name().to_owned());
-            continue;
-        };
-        let ours = p.layout.import(theirs).filter(|t| t.shape() == p.value.shape());
-        let Some(ours) = ours else {
-            let expected = p.layout.export(&p.value);
-            return Err(Error::file(
-                path,
-                format!(
-                    "{} has shape {}, this model's has {}: were these weights made with another preset?",
-                    p.name(),
-                    theirs.shape(),
-                    expected.shape()
-                ),
-            ));
-        };
-        found.push((id, ours));
-    }
-    let unexpected: Vec<&String> =
-        tensors.keys().filter(|n| params.find(n).is_none() && !n.ends_with("num_batches_tracked")).collect();
-    if !missing.is_empty() || !unexpected.is_empty() {
-        let mut message = format!("{} tensors are missing, {} are unexpected", missing.len(), unexpected.len());
-        for (what, name) in [("missing", missing.first()), ("unexpected", unexpected.first().copied())] {
-            if let Some(name) = name {
-                message += &format!("; {what}: {name}, for example");
-            }
+/// # Errors
+/// As [`open`]; and if a tensor holds integers, or has more dimensions than a tensor can.
+pub fn read<T: Float>(path: &Path) -> Result<Contents<T>> {
+    let file = open(path)?;
+    let mut tensors = HashMap::new();
+    for (name, stored) in file.tensors {
+        let rank = stored.shape().len();
+        if rank > crate::tensor::shape::MAX_RANK {
+            return Err(Error::file(path, format!("{} has {rank} dimensions, more than a tensor can", shown(&name))));
         }
-        return Err(Error::file(path, message + ". Were these weights made with another preset?"));
+        let numbers = stored.to_f64().ok_or_else(|| {
+            let found = stored.dtype().name();
+            Error::file(path, format!("{} holds {found}: floating point was expected", shown(&name)))
+        })?;
+        let numbers = numbers.into_iter().map(T::of).collect();
+        tensors.insert(name, Tensor::from_vec(stored.shape(), numbers));
     }
-    for (id, value) in found {
-        params.set(id, value);
-    }
-    Ok(())
+    Ok(Contents { tensors, metadata: file.metadata })
 }

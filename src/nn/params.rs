@@ -36,6 +36,16 @@ impl Layout {
         })
     }
 
+    /// The dimensions in PyTorch's layout of a tensor that has these in this crate's.
+    pub fn exported(self, ours: &[usize]) -> Vec<usize> {
+        match (self, ours) {
+            (Layout::Conv, &[kh, kw, inputs, out]) => vec![out, inputs, kh, kw],
+            (Layout::Depthwise, &[kh, kw, c]) => vec![c, 1, kh, kw],
+            (Layout::Linear, &[inputs, out]) => vec![out, inputs],
+            _ => ours.to_vec(),
+        }
+    }
+
     /// A tensor in PyTorch's layout from one in this crate's.
     pub fn export<T: Float>(self, ours: &Tensor<T>) -> Tensor<T> {
         match (self, ours.dims()) {

@@ -21,19 +21,20 @@ pub fn write_npy(path: impl AsRef<Path>, values: &[f32], height: usize, width: u
 pub fn write_npy_shaped(path: impl AsRef<Path>, values: &[f32], shape: &[usize]) -> Result<()> {
     assert_eq!(values.len(), shape.iter().product::<usize>(), "write_npy: values for the shape {shape:?} expected");
     write_atomically(path, |writer| {
-        writer.write_all(&header(shape))?;
+        writer.write_all(&header("<f4", shape))?;
         write_values(writer, values)
     })
 }
 
 /// Magic, version, length, and a Python dictionary padded with spaces so that the values start at a multiple of 64.
-fn header(shape: &[usize]) -> Vec<u8> {
+/// `descr` is NumPy's name of the element type.
+pub(crate) fn header(descr: &str, shape: &[usize]) -> Vec<u8> {
     const FIXED: usize = 10;
     let dimensions = match shape {
         [one] => format!("{one},"),
         _ => shape.iter().map(usize::to_string).collect::<Vec<_>>().join(", "),
     };
-    let mut dictionary = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({dimensions}), }}");
+    let mut dictionary = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({dimensions}), }}");
     while !(FIXED + dictionary.len() + 1).is_multiple_of(64) {
         dictionary.push(' ');
     }
@@ -71,6 +72,6 @@ mod tests {
 
     #[test]
     fn one_dimension_keeps_its_comma() {
-        assert!(String::from_utf8_lossy(&header(&[7])).contains("(7,)"));
+        assert!(String::from_utf8_lossy(&header("<f4", &[7])).contains("(7,)"));
     }
 }

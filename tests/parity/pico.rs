@@ -2,21 +2,25 @@
 //! parameter, three AdamW steps, and evaluation after them.
 
 use std::collections::HashMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use parallax::monovit::loss::{Loss, LossConfig, Views, loss};
 use parallax::monovit::{MonoVit, Preset};
-use parallax::nn::{Context, Folded, Params, checkpoint};
+use parallax::nn::{Context, Folded, Named, Params, TensorFile, checkpoint, fit};
 use parallax::optim::{AdamW, Group};
 use parallax::random::Random;
 use parallax::tensor::{Float, Tape, Tensor, Var};
+
+fn fixture() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/pico.safetensors")
+}
 
 struct Reference<T: Float>(HashMap<String, Tensor<T>>);
 
 impl<T: Float> Reference<T> {
     fn read() -> Self {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/pico.safetensors");
-        Reference(checkpoint::read(&path).expect("the fixture").tensors)
+        Reference(checkpoint::read(&fixture()).expect("the fixture").tensors)
     }
 
     fn get(&self, name: &str) -> &Tensor<T> {
@@ -26,11 +30,6 @@ impl<T: Float> Reference<T> {
     /// An image or map, from NCHW to NHWC.
     fn map(&self, name: &str) -> Tensor<T> {
         self.get(name).permute(&[0, 2, 3, 1])
-    }
-
-    /// The tensors under a prefix.
-    fn under(&self, prefix: &str) -> HashMap<String, Tensor<T>> {
-        self.0.iter().filter_map(|(n, t)| Some((n.strip_prefix(prefix)?.to_owned(), t.clone()))).collect()
     }
 }
 
@@ -44,8 +43,18 @@ impl<T: Float> Pico<T> {
     fn load() -> Self {
         let reference = Reference::read();
         let (model, mut params) = MonoVit::new(Preset::Pico.config(), 0);
-        checkpoint::import(&mut params, &reference.under("weights/"), Path::new("pico"))
-            .expect("the same names and shapes");
+        let file = TensorFile::open(&fixture()).expect("the fixture");
+        let weights: Vec<Named> = file
+            .tensors
+            .into_iter()
+            .filter_map(|(origin, tensor)| {
+                let name = origin.strip_prefix("weights/")?.to_owned();
+                Some(Named { name, origin, file: Arc::new(fixture()), tensor })
+            })
+            .collect();
+        let fitted = fit(&params, &weights).expect("numbers");
+        assert_eq!(fitted.report.problem(), None, "the same names and shapes");
+        fitted.put_into(&mut params);
         Pico { model, params, reference }
     }
 

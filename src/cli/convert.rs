@@ -1,0 +1,56 @@
+//! `parallax convert`.
+
+use std::path::PathBuf;
+
+use parallax::monovit::run::check_size;
+use parallax::monovit::weights::{self, Form, Need};
+use parallax::{Error, Result};
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// Weights: files (.pth, .safetensors, .npz), a folder with encoder.pth, depth.pth, ..., or a run's folder.
+    #[arg(value_name = "IN", required = true, num_args = 1..)]
+    inputs: Vec<PathBuf>,
+    /// What to write: a .safetensors, .npz or .pth file, or, without an ending, a folder with the published set:
+    /// encoder.pth, depth.pth, pose_encoder.pth, pose.pth.
+    #[arg(value_name = "OUT")]
+    out: PathBuf,
+    /// Take what fits and leave out the rest, which is listed.
+    #[arg(long)]
+    allow_partial: bool,
+    /// Height of the pictures that the network saw, instead of what the weights say.
+    #[arg(long, value_name = "PIXELS")]
+    height: Option<usize>,
+    /// Width of the pictures that the network saw, instead of what the weights say.
+    #[arg(long, value_name = "PIXELS")]
+    width: Option<usize>,
+    /// Replace what stands at OUT.
+    #[arg(long)]
+    force: bool,
+    /// Print one JSON object: what was matched, missing, unexpected.
+    #[arg(long)]
+    json: bool,
+}
+
+pub fn run(args: Args) -> Result<()> {
+    for (name, size) in [("--height", args.height), ("--width", args.width)] {
+        size.map_or(Ok(()), |size| check_size(name, size))?;
+    }
+    let form = Form::of(&args.out)?;
+    let mut weights = weights::load(&args.inputs, Need::Any, args.allow_partial)?;
+    weights.config.height = args.height.unwrap_or(weights.config.height);
+    weights.config.width = args.width.unwrap_or(weights.config.width);
+    let outputs = weights::outputs(&weights, &args.out, form);
+    if let (false, Some(there)) = (args.force, outputs.iter().find(|p| p.exists())) {
+        return Err(Error::file(there, "is there already: --force replaces it (OUT is the last argument)"));
+    }
+    weights::save(&weights, &args.out, form)?;
+    if args.json {
+        return super::print_json(&weights.report);
+    }
+    println!("{}", weights.report);
+    for output in outputs {
+        println!("wrote       {}", output.display());
+    }
+    Ok(())
+}

@@ -1,0 +1,51 @@
+//! The flags that say which weights to use, the same wherever weights are used.
+
+use std::path::PathBuf;
+
+use parallax::Result;
+use parallax::monovit::run::check_size;
+use parallax::monovit::weights::{self, Need, Weights};
+
+#[derive(clap::Args)]
+pub struct WeightsArgs {
+    /// Weights: a run's folder (its best weights), a file (.safetensors, .pth, .npz), or a folder with encoder.pth,
+    /// depth.pth, ...; several times for several files.
+    #[arg(long, value_name = "FILE|DIR", required = true)]
+    weights: Vec<PathBuf>,
+    /// Take what fits and leave out the rest, which is listed.
+    #[arg(long)]
+    allow_partial: bool,
+    /// Height of the pictures that the network sees, instead of what the weights say.
+    #[arg(long, value_name = "PIXELS")]
+    height: Option<usize>,
+    /// Width of the pictures that the network sees, instead of what the weights say.
+    #[arg(long, value_name = "PIXELS")]
+    width: Option<usize>,
+}
+
+impl WeightsArgs {
+    /// What was asked for, in words.
+    pub fn name(&self) -> String {
+        let names: Vec<_> = self.weights.iter().map(|w| w.to_string_lossy()).collect();
+        names.join(", ")
+    }
+
+    /// The weights that were asked for, to predict depth with.
+    pub fn load(&self) -> Result<Weights> {
+        self.check()?;
+        let mut weights = weights::load(&self.weights, Need::Depth, self.allow_partial)?;
+        if weights.report.problem().is_some() {
+            eprintln!("{}", weights.report);
+        }
+        weights.config.height = self.height.unwrap_or(weights.config.height);
+        weights.config.width = self.width.unwrap_or(weights.config.width);
+        Ok(weights)
+    }
+
+    fn check(&self) -> Result<()> {
+        for (name, size) in [("--height", self.height), ("--width", self.width)] {
+            size.map_or(Ok(()), |size| check_size(name, size))?;
+        }
+        Ok(())
+    }
+}

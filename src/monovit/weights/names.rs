@@ -1,0 +1,166 @@
+//! From the names in a file to the names of the model.
+//!
+//! Published weights come as one file a network, each with names of its own (`stem.0.conv.weight`, `convs.f4...`,
+//! `encoder.conv1.weight`, `net.0.weight`), or as one file with the networks' names in front, and either may be wrapped
+//! once more by what trained it (`module.`, `model.`, `state_dict.`).
+
+use std::sync::LazyLock;
+
+use crate::monovit::{MonoVit, Preset};
+use crate::nn::Params;
+
+/// The four networks, as the model's names begin.
+pub const NETWORKS: [&str; 4] = ["encoder", "depth", "pose_encoder", "pose"];
+
+/// What stands in front of names without meaning anything here.
+const WRAPPERS: [&str; 6] = ["module.", "model.", "state_dict.", "model_state_dict.", "network.", "_orig_mod."];
+
+/// What a tensor in a file is.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Place {
+    /// A parameter, if there is one of this name.
+    Model(String),
+    /// Something that no model here has a use for: what, in the plural.
+    Useless(&'static str),
+    /// Something unknown.
+    Unknown,
+}
+
+/// A name without the wrappers in front of it.
+pub(super) fn unwrapped(mut name: &str) -> &str {
+    while let Some(rest) = WRAPPERS.iter().find_map(|w| name.strip_prefix(w)) {
+        name = rest;
+    }
+    name
+}
+
+/// What the tensor of this name is.
+pub(super) fn place(name: &str) -> Place {
+    let name = unwrapped(name);
+    if name == "num_batches_tracked" || name.ends_with(".num_batches_tracked") {
+        return Place::Useless("counters of batches");
+    }
+    if name.starts_with("optimizer.") {
+        return Place::Useless("tensors of an optimizer");
+    }
+    if let Some((network, rest)) = own(name) {
+        return Place::Model(format!("{network}.{rest}"));
+    }
+    let (root, inner) = name.split_once('.').unwrap_or((name, ""));
+    let networks: &[&str] = match root {
+        // Both encoders are called that: the depth encoder among others, the ResNet in its own file.
+        "encoder" => &["encoder", "pose_encoder"],
+        "depth" | "decoder" => &["depth"],
+        "pose_encoder" => &["pose_encoder"],
+        "pose" => &["pose"],
+        _ => &[],
+    };
+    let is_encoder = networks.iter().any(|n| n.ends_with("encoder"));
+    let head = |name: &str| name.starts_with("cls_head.") || name.starts_with("fc.");
+    if head(name) || is_encoder && head(inner) || root == "pose_encoder" && inner.starts_with("encoder.fc.") {
+        return Place::Useless("tensors of a classification head");
+    }
+    match own(inner) {
+        Some((network, rest)) if networks.contains(&network) => Place::Model(format!("{network}.{rest}")),
+        _ => Place::Unknown,
+    }
+}
+
+/// The network that uses this name without its own in front, and the name there.
+fn own(name: &str) -> Option<(&'static str, String)> {
+    let (first, rest) = name.split_once('.')?;
+    match first {
+        "stem" | "patch_embed_stages" | "mhca_stages" => Some(("encoder", name.to_owned())),
+        "convs" => Some(("depth", name.to_owned())),
+        // The same modules once more, numbered.
+        "decoder" => {
+            let (number, rest) = rest.split_once('.')?;
+            let key = DECODER_KEYS.get(number.parse::<usize>().ok()?)?;
+            Some(("depth", format!("convs.{key}.{rest}")))
+        }
+        "net" => Some(("pose", name.to_owned())),
+        "conv1" | "bn1" | "layer1" | "layer2" | "layer3" | "layer4" => {
+            Some(("pose_encoder", format!("encoder.{name}")))
+        }
+        // (Not again and again.)
+        "encoder" if !rest.starts_with("encoder.") && matches!(own(rest), Some(("pose_encoder", _))) => {
+            Some(("pose_encoder", name.to_owned()))
+        }
+        _ => None,
+    }
+}
+
+/// The decoder's modules in the order of the public checkpoints.
+pub(super) static DECODER_KEYS: LazyLock<Vec<String>> = LazyLock::new(|| {
+    // They are the same for every size.
+    let (_, params): (_, Params<f32>) = MonoVit::new(Preset::Pico.config(), 0);
+    let names = params.iter().filter_map(|(_, p)| p.name().strip_prefix("depth.convs.")?.split('.').next());
+    let mut keys: Vec<String> = Vec::new();
+    for key in names {
+        if keys.iter().all(|k| k != key) {
+            keys.push(key.to_owned());
+        }
+    }
+    keys
+});
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_arrangement_has_its_place() {
+        let cases = [
+            ("stem.0.conv.weight", "encoder.stem.0.conv.weight"),
+            ("encoder.stem.0.conv.weight", "encoder.stem.0.conv.weight"),
+            ("module.encoder.stem.0.conv.weight", "encoder.stem.0.conv.weight"),
+            ("state_dict.module.mhca_stages.0.x", "encoder.mhca_stages.0.x"),
+            ("model.patch_embed_stages.0.x", "encoder.patch_embed_stages.0.x"),
+            ("convs.f4.conv_se.bias", "depth.convs.f4.conv_se.bias"),
+            ("decoder.0.conv_se.bias", "depth.convs.f4.conv_se.bias"),
+            ("decoder.convs.f4.conv_se.bias", "depth.convs.f4.conv_se.bias"),
+            ("module.decoder.decoder.36.conv.bias", "depth.convs.dispconv3.conv.bias"),
+            ("depth.decoder.1.conv_se.bias", "depth.convs.f3.conv_se.bias"),
+            ("depth.convs.f4.conv_se.bias", "depth.convs.f4.conv_se.bias"),
+            ("encoder.conv1.weight", "pose_encoder.encoder.conv1.weight"),
+            ("encoder.layer4.1.bn2.bias", "pose_encoder.encoder.layer4.1.bn2.bias"),
+            ("pose_encoder.encoder.bn1.bias", "pose_encoder.encoder.bn1.bias"),
+            ("conv1.weight", "pose_encoder.encoder.conv1.weight"),
+            ("net.3.bias", "pose.net.3.bias"),
+            ("pose.net.3.bias", "pose.net.3.bias"),
+        ];
+        for (theirs, ours) in cases {
+            assert_eq!(place(theirs), Place::Model(ours.into()), "{theirs}");
+        }
+        let useless = [
+            "fc.weight",
+            "encoder.fc.bias",
+            "pose_encoder.encoder.fc.bias",
+            "cls_head.cls.weight",
+            "model.stem.0.bn.num_batches_tracked",
+            "optimizer.state.0.exp_avg",
+        ];
+        for name in useless {
+            assert!(matches!(place(name), Place::Useless(_)), "{name}");
+        }
+        let unknown = [
+            "",
+            ".",
+            "stem",
+            "pose.stem.0.conv.weight",
+            "encoder.convs.f4.x",
+            "decoder.37.conv.bias",
+            "decoder.x.bias",
+            "encoder.encoder.conv1.weight",
+            "transformer.fc.weight",
+            "depth.fc.weight",
+        ];
+        for name in unknown {
+            assert_eq!(place(name), Place::Unknown, "{name}");
+        }
+        // Neither depth nor length costs anything.
+        for part in ["encoder.", "module.", "decoder."] {
+            assert_eq!(place(&part.repeat(1 << 20)), Place::Unknown);
+        }
+    }
+}
