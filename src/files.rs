@@ -43,6 +43,17 @@ pub fn write_bytes_atomically(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()
     write_atomically(path, |writer| writer.write_all(bytes))
 }
 
+/// Makes sure that files can be written into a folder, which is made if it is missing: to be called before anything
+/// that takes time.
+///
+/// # Errors
+/// If the folder cannot be made or written into.
+pub fn check_writable(folder: impl AsRef<Path>) -> Result<()> {
+    let probe = folder.as_ref().join(".writable");
+    write_bytes_atomically(&probe, b"")?;
+    fs::remove_file(&probe).map_err(|e| Error::io(probe, e))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -12,6 +12,7 @@ use parallax::monovit::metrics::Metrics;
 use parallax::monovit::run::{Ended, Event, Run, RunConfig, RunData, RunMetrics, read_config};
 use parallax::{Error, Result};
 
+use super::ablation;
 use super::progress::Progress;
 
 /// Steps of the default run.
@@ -67,6 +68,10 @@ pub struct Args {
     /// Print `metrics.json` on standard output at the end, and nothing else there.
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    networks: ablation::Networks,
+    #[command(flatten)]
+    loss: ablation::Loss,
 }
 
 pub fn run(args: Args) -> Result<()> {
@@ -195,6 +200,8 @@ fn configuration(args: &Args) -> Result<RunConfig> {
             *to = from.clone();
         }
     }
+    args.networks.apply(&mut c.ablation);
+    args.loss.apply(&mut c.loss);
     if let Some(rate) = args.learning_rate {
         if !(rate > 0.0 && rate.is_finite()) {
             return Err(Error::setting("--learning-rate", format!("{rate} is not a number above 0")));

@@ -1,5 +1,6 @@
 //! MonoViT (Zhao et al., 3DV 2022, 2208.03543): self-supervised monocular depth, as the paper tells it.
 
+pub mod attention;
 pub mod config;
 pub mod decoder;
 pub mod encoder;
@@ -12,6 +13,6 @@ pub mod run;
 pub mod shake;
 pub mod trainer;
 
-pub use config::{Config, Preset};
+pub use config::{Ablation, Config, Preset};
 pub use model::MonoVit;
 pub use trainer::{OptimConfig, StepReport, Trainer};

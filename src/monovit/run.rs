@@ -12,7 +12,7 @@ use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 
-use super::config::{Config, Preset};
+use super::config::{Ablation, Config, Preset};
 use super::evaluation::{Evaluation, Predictor, evaluate, evaluate_mean_map};
 use super::loss::LossConfig;
 use super::metrics::{MeanMap, Metrics, Protocol, Scale};
@@ -22,7 +22,7 @@ use super::trainer::{OptimConfig, StepReport, Trainer};
 use crate::data::Dataset;
 use crate::data::batch::{Augment, Batch, Loader, batch_of_step};
 use crate::error::{Error, Result};
-use crate::files::write_bytes_atomically;
+use crate::files::{check_writable, write_bytes_atomically};
 use crate::nn::{Params, checkpoint};
 use crate::optim::{Decay, Schedule};
 use crate::report::colormap::disparity_to_image;
@@ -59,6 +59,9 @@ pub struct RunConfig {
     pub log_every: u64,
     /// The whole state is written, and the weights are validated, every so many steps.
     pub checkpoint_every: u64,
+    /// What is taken away from the named sizes.
+    #[serde(default)]
+    pub ablation: Ablation,
     /// Augmentation.
     pub augment: Augment,
     /// The loss.
@@ -84,6 +87,7 @@ impl RunConfig {
             initial_disparity: Some(0.15),
             log_every: 10,
             checkpoint_every: 200,
+            ablation: Ablation::default(),
             augment: Augment { flip: true, jitter: false },
             loss: LossConfig {
                 auto_mask_after: 300,
@@ -124,7 +128,7 @@ impl RunConfig {
 
     /// The sizes of the networks.
     pub fn model(&self) -> Config {
-        self.preset.config()
+        self.ablation.apply(self.preset.config())
     }
 
     /// Checks what can be checked without data.
@@ -140,7 +144,8 @@ impl RunConfig {
         if self.steps == 0 {
             return Err(Error::setting("--steps", "at least 1"));
         }
-        Ok(())
+        self.loss.check()?;
+        self.ablation.check(&self.preset.config())
     }
 }
 
@@ -262,9 +267,7 @@ impl Run {
             let message = "is not empty: give another folder with --out, or go on with --resume";
             return Err(Error::file(folder, message));
         }
-        let probe = folder.join(".writable");
-        write_bytes_atomically(&probe, b"")?;
-        fs::remove_file(&probe).map_err(|e| Error::io(probe, e))
+        check_writable(folder)
     }
 
     /// A new run in an empty or missing folder.
@@ -291,7 +294,9 @@ impl Run {
 
     /// A run that was interrupted, where it stood.
     pub fn resume(folder: &Path) -> Result<Self> {
-        let config = read_config(&folder.join("config.toml"))?;
+        let path = folder.join("config.toml");
+        let config = read_config(&path)?;
+        config.check().map_err(|e| Error::file(&path, e.to_string()))?;
         let trainer = Trainer::new(config.model(), config.optim, config.loss, config.seed);
         let mut run = Self::of(folder, config, trainer);
         let state = run.state_file();
@@ -544,6 +549,7 @@ pub fn load_weights(path: &Path) -> Result<(MonoVit, Params<f32>, RunConfig)> {
     })?;
     let config: RunConfig =
         serde_json::from_str(config).map_err(|e| Error::file(&path, format!("its configuration: {e}")))?;
+    config.check().map_err(|e| Error::file(&path, format!("its configuration: {e}")))?;
     let (model, mut params) = MonoVit::new(config.model(), 0);
     checkpoint::import(&mut params, &contents.tensors, &path)?;
     Ok((model, params, config))
