@@ -270,4 +270,80 @@ mod tests {
         assert!(found.unwarped.abs() < 1e-12 && found.warped < 1e-6, "{} {}", found.unwarped, found.warped);
         assert!(found.smoothness.abs() < 1e-12, "a constant disparity is smooth");
     }
+
+    fn image(size: [usize; 4], seed: u64) -> Var<f64> {
+        let mut random = Random::new(seed, 0);
+        Var::constant(Tensor::build(size, |out| out.iter_mut().for_each(|x| *x = random.unit())))
+    }
+
+    /// Two scales of noise, two sources that have moved.
+    fn noise() -> (Vec<Var<f64>>, Vec<Var<f64>>, Views<f64>) {
+        let (full, half) = ([2, 16, 24, 3], [2, 8, 12, 3]);
+        let views = Views {
+            pyramid: vec![image(full, 1), image(half, 2)],
+            sources: vec![image(full, 3), image(full, 4)],
+            smaller_sources: vec![vec![image(half, 5), image(half, 6)]],
+            intrinsics: vec![[14.0, 18.0, 12.0, 8.0], [15.0, 17.0, 11.0, 8.5]],
+        };
+        let disparities = vec![image([2, 16, 24, 1], 7), image([2, 8, 12, 1], 8)];
+        let pose = |x: f64| {
+            let numbers = |x: f64| Var::constant(Tensor::from_vec([2, 3], [x, -x, 0.5 * x].repeat(2)));
+            Var::pose_matrix(&numbers(0.1 * x), &numbers(x), false)
+        };
+        (disparities, vec![pose(0.1), pose(-0.07)], views)
+    }
+
+    #[test]
+    fn the_average_is_that_of_the_losses_of_single_sources() {
+        let (disparities, transforms, views) = noise();
+        let config = LossConfig { auto_mask: false, smoothness: 0.0, ..LossConfig::default() };
+        let average = LossConfig { reprojection: Reprojection::Average, ..config };
+        let of = |which: usize| {
+            let views = Views {
+                pyramid: views.pyramid.clone(),
+                sources: vec![views.sources[which].clone()],
+                smaller_sources: vec![],
+                intrinsics: views.intrinsics.clone(),
+            };
+            loss(&disparities, &transforms[which..=which], &views, &config, None).photometric
+        };
+        let found = loss(&disparities, &transforms, &views, &average, None);
+        let expected = 0.5 * (of(0) + of(1));
+        assert!((found.photometric - expected).abs() < 1e-12, "{} for {expected}", found.photometric);
+        assert!((found.warped - expected).abs() < 1e-12 && found.auto_mask == 1.0);
+        // The smaller of two means, pixel by pixel, is at most the mean of either.
+        let masked = loss(&disparities, &transforms, &views, &LossConfig { auto_mask: true, ..average }, None);
+        assert!(masked.photometric < masked.warped.min(masked.unwarped), "{}", masked.photometric);
+        assert!(loss(&disparities, &transforms, &views, &config, None).photometric < expected, "the minimum is less");
+    }
+
+    #[test]
+    fn a_scale_at_its_own_size_is_a_full_size_of_smaller_images() {
+        let (disparities, transforms, views) = noise();
+        let own = LossConfig { scales: Scales::Own, smoothness: 0.0, ..LossConfig::default() };
+        let smaller = Views {
+            pyramid: views.pyramid[1..].to_vec(),
+            sources: views.smaller_sources[0].clone(),
+            smaller_sources: vec![],
+            intrinsics: views.intrinsics.iter().map(|k| k.map(|pixels| 0.5 * pixels)).collect(),
+        };
+        let first = loss(&disparities[..1], &transforms, &views, &own, None).photometric;
+        let second = loss(&disparities[1..], &transforms, &smaller, &own, None).photometric;
+        let found = loss(&disparities, &transforms, &views, &own, None).photometric;
+        assert!((found - 0.5 * (first + second)).abs() < 1e-12, "{found} for {first} and {second}");
+        let full = loss(&disparities, &transforms, &views, &LossConfig { scales: Scales::Full, ..own }, None);
+        assert!((found - full.photometric).abs() > 1e-6, "not the same as at full size");
+    }
+
+    #[test]
+    fn settings_that_cannot_be_are_named() {
+        let refused = |config: LossConfig| config.check().unwrap_err().to_string();
+        let usual = LossConfig::default();
+        usual.check().unwrap();
+        assert!(refused(LossConfig { ssim: 1.5, ..usual }).contains("loss.ssim: 1.5"));
+        assert!(refused(LossConfig { ssim: f64::NAN, ..usual }).contains("loss.ssim"));
+        assert!(refused(LossConfig { min_depth: 0.0, ..usual }).contains("loss.min_depth"));
+        assert!(refused(LossConfig { min_depth: 200.0, ..usual }).contains("200 to 100"));
+        assert!(refused(LossConfig { smoothness: -1.0, ..usual }).contains("loss.smoothness"));
+    }
 }
