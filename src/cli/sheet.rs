@@ -107,7 +107,7 @@ fn legend(sheet: &mut RgbImage) {
         let colour = glow(90.0, 2.0 * column as f32 / (LENGTH - 1) as f32 - 1.0);
         (3..15).for_each(|row| sheet.put_pixel(x + column, y + row, colour));
     }
-    write(sheet, " adds   each map by its own largest", x + LENGTH, y);
+    write(sheet, " adds   every map scaled by its own largest weight", x + LENGTH, y);
 }
 
 /// Writes a line of text, as far as the sheet goes; returns where it ends.

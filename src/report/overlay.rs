@@ -55,8 +55,7 @@ pub fn glow(grey: f32, strength: f32) -> Rgb<u8> {
     let mut rgb = [0; 3];
     for (i, byte) in rgb.iter_mut().enumerate() {
         let colour = faint[i] + t * (full[i] - faint[i]);
-        let cover = t.powf(0.7);
-        *byte = (grey + cover * (colour - grey)).round().clamp(0.0, 255.0) as u8;
+        *byte = (grey + t * (colour - grey)).round().clamp(0.0, 255.0) as u8;
     }
     Rgb(rgb)
 }
