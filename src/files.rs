@@ -48,7 +48,8 @@ pub fn write_bytes_atomically(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()
 ///
 /// # Errors
 /// If the folder cannot be made, or nothing can be written into it.
-pub fn check_writable(folder: &Path) -> Result<()> {
+pub fn check_writable(folder: impl AsRef<Path>) -> Result<()> {
+    let folder = folder.as_ref();
     fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
     let probe = folder.join(".writable");
     write_bytes_atomically(&probe, b"")?;

@@ -8,7 +8,8 @@ use std::sync::Arc;
 use parallax::data::Dataset;
 use parallax::data::street::{Street, StreetConfig};
 use parallax::monovit::Preset;
-use parallax::monovit::run::{Ended, Event, Run, RunConfig, RunData};
+use parallax::monovit::loss::{Reprojection, Scales};
+use parallax::monovit::run::{Ended, Event, Run, RunConfig, RunData, load_weights, read_config};
 use parallax::monovit::shake::Shake;
 
 fn street(seed: u64) -> Arc<dyn Dataset> {
@@ -105,6 +106,52 @@ fn wrong_settings_are_named_before_any_time_is_spent() {
     fails(&["train", "--resume", "/no/such/run"], 1, &["/no/such/run"]);
     fails(&["gradcheck", "--op", "nonsense"], 1, &["--op", "conv2d"]);
     assert!(!Path::new(out).exists(), "nothing was made");
+}
+
+/// What a run of an earlier version wrote, without the settings that came later.
+#[test]
+fn a_configuration_from_before_the_ablations_still_loads() {
+    let place = tempfile::tempdir().expect("a folder");
+    let path = place.path().join("config.toml");
+    let text = toml::to_string(&config()).expect("TOML");
+    let later = ["[ablation]", "cnn_path", "decoder_attention", "reprojection", "scales"];
+    let old: String =
+        text.lines().filter(|l| !later.iter().any(|x| l.starts_with(x))).flat_map(|l| [l, "\n"]).collect();
+    assert_eq!(text.lines().count(), old.lines().count() + later.len());
+    std::fs::write(&path, &old).expect("written");
+    assert_eq!(read_config(&path).expect("read"), config());
+    let broken = text.replace("cnn_path = true", "cnn_path = false\ntransformer_paths = 0");
+    std::fs::write(&path, broken).expect("written");
+    let path = path.to_str().expect("a path in UTF-8");
+    fails(&["train", "--config", path, "--out", &format!("{path}.run")], 1, &["cnn_path", "neither"]);
+}
+
+#[test]
+fn flags_of_ablations_win_over_the_configuration_and_are_written_into_the_run() {
+    let place = tempfile::tempdir().expect("a folder");
+    let path = |name: &str| place.path().join(name).to_str().expect("a path in UTF-8").to_owned();
+    let street = path("street");
+    let size = ["--sequences", "1", "--frames", "14", "--height", "64", "--width", "96"];
+    assert!(parallax(&[&["data", "street", "--out", &street][..], &size].concat()).status.success());
+    let mut shorter = config();
+    (shorter.steps, shorter.loss.shake.steps, shorter.data) = (1, 0, street);
+    std::fs::write(path("config.toml"), toml::to_string(&shorter).expect("TOML")).expect("written");
+    let (config, run) = (path("config.toml"), path("run"));
+    let networks = ["--transformer-paths", "1", "--no-decoder-attention", "--drop-path", "0.5"];
+    let loss = ["--no-auto-mask", "--reprojection", "average", "--scales", "own", "--ssim", "0"];
+    let output = parallax(&[&["train", "--config", &config, "--out", &run][..], &networks, &loss].concat());
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let written = read_config(&place.path().join("run/config.toml")).expect("read");
+    assert_eq!(written.model().paths, [1; 4]);
+    assert_eq!((written.ablation.decoder_attention, written.ablation.drop_path), (false, Some(0.5)));
+    assert_eq!((written.loss.reprojection, written.loss.scales), (Reprojection::Average, Scales::Own));
+    assert_eq!((written.loss.auto_mask, written.loss.ssim), (false, 0.0));
+    // The weights remember what they were made for.
+    let (model, ..) = load_weights(&place.path().join("run")).expect("weights");
+    assert_eq!(model.config, written.model());
+    fails(&["train", "--ssim", "2", "--out", &path("no")], 1, &["loss.ssim", "2"]);
+    fails(&["train", "--transformer-paths", "7", "--out", &path("no")], 1, &["transformer_paths", "7"]);
+    fails(&["info", "--transformer-paths", "0", "--no-cnn-path"], 1, &["cnn_path", "neither"]);
 }
 
 #[test]

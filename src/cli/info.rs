@@ -7,7 +7,16 @@ use parallax::ops::trace;
 use parallax::tensor::{Tensor, Var};
 use serde::Serialize;
 
+use super::ablation::Networks;
 use super::sizes::Sizes;
+
+#[derive(clap::Args)]
+pub struct Args {
+    #[command(flatten)]
+    sizes: Sizes,
+    #[command(flatten)]
+    networks: Networks,
+}
 
 #[derive(Serialize)]
 struct Parameters {
@@ -25,9 +34,10 @@ struct Info {
     memory_bytes: u64,
 }
 
-pub fn run(args: Sizes) -> Result<()> {
+pub fn run(args: Args) -> Result<()> {
+    let Args { sizes: args, networks } = args;
     args.check()?;
-    let (model, params) = MonoVit::new::<f32>(args.preset.config(), 0);
+    let (model, params) = MonoVit::new::<f32>(networks.config(args.preset)?, 0);
     // Counted by running one picture: the arithmetic of an op is said by the op itself.
     let c = Context::inference(&params);
     let image = Var::constant(Tensor::zeros([1, args.height, args.width, 3]));

@@ -1,5 +1,7 @@
 //! The command line: arguments in, library calls, tables and JSON out. Exit status 0 done, 1 failed, 2 wrong usage.
 
+mod ablation;
+mod attention;
 mod bench;
 mod convert;
 mod data;
@@ -8,6 +10,7 @@ mod gradcheck;
 mod info;
 mod predict;
 mod progress;
+mod sheet;
 mod sizes;
 mod train;
 mod weights;
@@ -38,12 +41,14 @@ enum Command {
     Predict(predict::Args),
     /// Turn weights into another kind of file: PyTorch's .pth, safetensors, NumPy's .npz.
     Convert(convert::Args),
+    /// Show what a pixel looks at: attention by path and head, and what its disparity depends on.
+    Attention(attention::Args),
     /// Check every op's gradient against finite differences, now, on this machine.
     Gradcheck(gradcheck::Args),
     /// Time a training step or an inference, op by op.
     Bench(bench::Args),
     /// Count parameters, arithmetic and memory before you start.
-    Info(sizes::Sizes),
+    Info(info::Args),
     /// Write the embedded street as files.
     Data(data::Args),
 }
@@ -56,6 +61,7 @@ pub fn main() -> ExitCode {
         Command::Eval(args) => eval::run(args),
         Command::Predict(args) => predict::run(args),
         Command::Convert(args) => convert::run(args),
+        Command::Attention(args) => attention::run(args),
         Command::Gradcheck(args) => gradcheck::run(args),
         Command::Bench(args) => bench::run(args),
         Command::Info(args) => info::run(args),

@@ -14,6 +14,7 @@ use parallax::monovit::start::Start;
 use parallax::monovit::weights::preset_of;
 use parallax::{Error, Result};
 
+use super::ablation;
 use super::progress::Progress;
 
 /// Steps of the default run.
@@ -79,6 +80,10 @@ pub struct Args {
     /// Print `metrics.json` on standard output at the end, and nothing else there.
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    networks: ablation::Networks,
+    #[command(flatten)]
+    loss: ablation::Loss,
 }
 
 pub fn run(args: Args) -> Result<()> {
@@ -225,6 +230,8 @@ fn configuration(args: &Args) -> Result<RunConfig> {
         c.init.clone_from(&args.init);
     }
     c.allow_partial |= args.allow_partial;
+    args.networks.apply(&mut c.ablation);
+    args.loss.apply(&mut c.loss);
     if let Some(rate) = args.learning_rate {
         if !(rate > 0.0 && rate.is_finite()) {
             return Err(Error::setting("--learning-rate", format!("{rate} is not a number above 0")));

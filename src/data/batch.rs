@@ -45,6 +45,29 @@ pub struct Batch {
     pub intrinsics: Vec<[f64; 4]>,
 }
 
+impl Batch {
+    /// The sources at 1/2, 1/4, 1/8 of their size, made like the target's pyramid: for each scale the previous and the
+    /// next frames, `[B, h, w, 3]`.
+    pub fn smaller_sources(&self) -> Vec<[Tensor<f32>; 2]> {
+        let mut images = self.sources.each_ref().map(to_images);
+        let smaller = (1..SCALES).map(|_| {
+            images = images.each_ref().map(|of| of.iter().map(|i| lanczos(i, i.width() / 2, i.height() / 2)).collect());
+            images.each_ref().map(|of| to_tensor(&of.iter().collect::<Vec<_>>()))
+        });
+        smaller.collect()
+    }
+}
+
+/// The 8-bit images that a tensor was made of by [`to_tensor`].
+fn to_images(tensor: &Tensor<f32>) -> Vec<RgbImage> {
+    let [_, h, w, _] = tensor.shape().nhwc().expect("images");
+    let image = |pixels: &[f32]| {
+        let bytes = pixels.iter().map(|&x| (x * 255.0).round() as u8).collect();
+        RgbImage::from_raw(w as u32, h as u32, bytes).expect("three bytes a pixel")
+    };
+    tensor.data().chunks_exact(3 * h * w).map(image).collect()
+}
+
 /// Images of one size side by side, as `[B, h, w, 3]` in [0, 1].
 ///
 /// # Panics
@@ -178,6 +201,22 @@ impl Drop for Loader {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::data::street::{Street, StreetConfig};
+
+    #[test]
+    fn smaller_sources_are_made_like_the_pyramid_of_the_target() {
+        let config = StreetConfig { height: 64, width: 96, sequences: 1, frames: 5, ..StreetConfig::default() };
+        let street = Street::render(&config, None);
+        let plain = Augment { flip: false, jitter: false };
+        let mut batch = batch_of_step(&street, plain, 2, 0, 0).unwrap();
+        batch.sources[1] = batch.pyramid[0].clone();
+        let smaller = batch.smaller_sources();
+        assert_eq!(smaller.len(), 3);
+        for (scale, [previous, next]) in smaller.iter().enumerate() {
+            assert!(next.same_bits(&batch.pyramid[scale + 1]), "scale {}", scale + 1);
+            assert!(!previous.same_bits(next));
+        }
+    }
 
     #[test]
     fn every_epoch_sees_every_sample_once() {

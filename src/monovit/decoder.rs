@@ -41,7 +41,6 @@ impl Decoder {
     pub fn new<T: Float>(b: &mut Builder<T>, config: &Config) -> Self {
         let b = &mut b.at("convs");
         let (features, e, d) = (config.feature_channels(), config.lateral_channels(), config.decoder_channels());
-        let r = config.reduction;
         // Channels of node (i, j).
         let width = |i: usize, j: usize| match j {
             0 => e[i],
@@ -49,7 +48,7 @@ impl Decoder {
         };
         let mut lateral: Vec<AttentionConv> = (1..5)
             .rev()
-            .map(|i| AttentionConv::new(&mut b.at(format!("f{i}")), [features[i], e[i]], r, "ca.fc", 3))
+            .map(|i| AttentionConv::new(&mut b.at(format!("f{i}")), [features[i], e[i]], config, "ca.fc", 3))
             .collect();
         lateral.reverse();
 
@@ -70,7 +69,7 @@ impl Decoder {
         for (i, j) in [(3, 1), (2, 2), (1, 3), (0, 4)] {
             let channels = [joined(i, j), width(i + 1, j - 1) / 2];
             let mut b = b.at(format!("X_{i}{j}_attention"));
-            attention.insert((i, j), AttentionConv::new(&mut b, channels, r, "fc", 1));
+            attention.insert((i, j), AttentionConv::new(&mut b, channels, config, "fc", 1));
         }
         let mut narrow = BTreeMap::new();
         for (i, j) in ORDER.into_iter().filter(|&n| !on_diagonal(n)) {
@@ -138,33 +137,52 @@ impl ConvBlock {
     }
 }
 
-/// Channel attention (Hu et al., 1709.01507), then a convolution and ReLU:
-/// z * sigmoid(fc2(relu(fc0(mean of z over the image)))).
+/// Channel attention, if the configuration has it, then a convolution and ReLU.
 #[derive(Clone, Debug)]
 struct AttentionConv {
-    squeeze: Linear,
-    excite: Linear,
+    attention: Option<ChannelAttention>,
     conv: Conv,
 }
 
 impl AttentionConv {
-    fn new<T: Float>(b: &mut Builder<T>, channels: [usize; 2], reduction: usize, fc: &str, kernel: usize) -> Self {
+    fn new<T: Float>(b: &mut Builder<T>, channels: [usize; 2], config: &Config, fc: &str, kernel: usize) -> Self {
         let [inputs, _] = channels;
-        let hidden = inputs / reduction;
-        let squeeze = Linear::new(&mut b.at(format!("{fc}.0")), [inputs, hidden], Init::FanIn(inputs), false);
-        let excite = Linear::new(&mut b.at(format!("{fc}.2")), [hidden, inputs], Init::FanIn(hidden), false);
+        let attention =
+            config.decoder_attention.then(|| ChannelAttention::new(&mut b.at(fc), inputs, inputs / config.reduction));
         let op = Conv2d::padded(kernel / 2).activated(Activation::Relu);
         let conv = Conv::new(&mut b.at("conv_se"), channels, kernel, op, ConvStart::FanInWithBias);
-        AttentionConv { squeeze, excite, conv }
+        AttentionConv { attention, conv }
     }
 
     fn forward<T: Float>(&self, c: &Context<T>, z: &Var<T>) -> Var<T> {
+        let Some(attention) = &self.attention else { return self.conv.forward(c, z) };
         let [b, _, _, channels] = z.shape().nhwc().expect("an image");
-        let gate = self.excite.forward(c, &self.squeeze.forward(c, &z.mean(1, 2)).relu()).sigmoid();
-        // Of one picture nobody trains on, the weights take the gate.
+        let gate = attention.gate(c, z);
+        // Of one picture nobody trains on, the weights take the gate: there are fewer of them than pixels.
         if b == 1 && !c.is_training() {
             return self.conv.forward_gated(c, z, &gate);
         }
         self.conv.forward(c, &(z * gate.reshape([b, 1, 1, channels])))
+    }
+}
+
+/// The gate of channel attention (Hu et al., 1709.01507), by which z is multiplied: sigmoid(fc2(relu(fc0(mean of z over the image)))).
+#[derive(Clone, Debug)]
+struct ChannelAttention {
+    squeeze: Linear,
+    excite: Linear,
+}
+
+impl ChannelAttention {
+    fn new<T: Float>(b: &mut Builder<T>, channels: usize, hidden: usize) -> Self {
+        ChannelAttention {
+            squeeze: Linear::new(&mut b.at("0"), [channels, hidden], Init::FanIn(channels), false),
+            excite: Linear::new(&mut b.at("2"), [hidden, channels], Init::FanIn(hidden), false),
+        }
+    }
+
+    /// One factor for each channel, `[B, C]`.
+    fn gate<T: Float>(&self, c: &Context<T>, z: &Var<T>) -> Var<T> {
+        self.excite.forward(c, &self.squeeze.forward(c, &z.mean(1, 2)).relu()).sigmoid()
     }
 }

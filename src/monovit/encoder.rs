@@ -33,7 +33,8 @@ impl Encoder {
         let embeddings: Vec<Vec<PatchEmbedding>> = (0..4)
             .map(|i| {
                 let mut b = b.at(format!("patch_embed_stages.{i}.patch_embeds"));
-                (0..config.paths[i])
+                // The CNN path reads the first embedding, so one is there without transformer paths too.
+                (0..config.paths[i].max(1))
                     .map(|p| {
                         PatchEmbedding::new(&mut b.at(format!("{p}.patch_conv")), d[i], if p == 0 { 2 } else { 1 })
                     })
@@ -88,10 +89,11 @@ impl PatchEmbedding {
     }
 }
 
-/// The joint CNN and transformer layer: both kinds of path side by side, concatenated and fused by a 1x1 convolution.
+/// The joint CNN and transformer layer: both kinds of path side by side, concatenated and fused by a 1x1 convolution,
+/// whose width follows the number of paths. Either kind may be missing.
 #[derive(Clone, Debug)]
 struct JointLayer {
-    convolutional: InvertedResidual,
+    convolutional: Option<InvertedResidual>,
     transformers: Vec<TransformerPath>,
     aggregate: ConvBn,
 }
@@ -99,18 +101,18 @@ struct JointLayer {
 impl JointLayer {
     fn new<T: Float>(b: &mut Builder<T>, config: &Config, stage: usize) -> Self {
         let (channels, paths) = (config.channels[stage], config.paths[stage]);
-        let out = config.channels[(stage + 1).min(3)];
+        let (out, parts) = (config.channels[(stage + 1).min(3)], paths + usize::from(config.cnn_path));
         JointLayer {
             transformers: (0..paths)
                 .map(|p| TransformerPath::new(&mut b.at(format!("mhca_blks.{p}")), config, stage))
                 .collect(),
-            convolutional: InvertedResidual::new(&mut b.at("InvRes"), channels),
-            aggregate: ConvBn::new(&mut b.at("aggregate"), [channels * (paths + 1), out], 1, 1, Activation::Hardswish),
+            convolutional: config.cnn_path.then(|| InvertedResidual::new(&mut b.at("InvRes"), channels)),
+            aggregate: ConvBn::new(&mut b.at("aggregate"), [channels * parts, out], 1, 1, Activation::Hardswish),
         }
     }
 
     fn forward<T: Float>(&self, c: &Context<T>, embedded: &[Var<T>]) -> Var<T> {
-        let mut parts = vec![self.convolutional.forward(c, &embedded[0])];
+        let mut parts: Vec<Var<T>> = self.convolutional.iter().map(|path| path.forward(c, &embedded[0])).collect();
         parts.extend(self.transformers.iter().zip(embedded).map(|(path, x)| path.forward(c, x)));
         self.aggregate.forward(c, &Var::concat(&parts.iter().collect::<Vec<_>>(), 3))
     }
@@ -211,6 +213,8 @@ impl RelativePosition {
 /// One transformer layer: position encoding, attention and MLP, each added to what it was computed from.
 #[derive(Clone, Debug)]
 struct TransformerLayer {
+    /// What an observer knows its q, k and v by.
+    name: String,
     norm1: LayerNorm,
     qkv: Linear,
     proj: Linear,
@@ -233,11 +237,13 @@ impl TransformerLayer {
             let init = b.start(Init::TruncatedNormal(0.02), inputs);
             Linear::new(b, [inputs, outputs], init, true)
         };
+        let name = b.at("factoratt_crpe.qkv").path().to_owned();
         let qkv = linear(&mut b.at("factoratt_crpe.qkv"), [channels, 3 * channels]);
         let proj = linear(&mut b.at("factoratt_crpe.proj"), [channels; 2]);
         relative.alias(&mut b.at("factoratt_crpe.crpe"));
         let hidden = channels * config.mlp_ratio;
         TransformerLayer {
+            name,
             qkv,
             proj,
             fc1: linear(&mut b.at("mlp.fc1"), [channels, hidden]),
@@ -261,6 +267,7 @@ impl TransformerLayer {
         let x = (x + position.forward(c, x)).reshape([b, h * w, channels]);
 
         let qkv = self.qkv.forward(c, &self.norm1.forward(c, &x));
+        c.observe(&self.name, &qkv);
         let windows: Vec<_> = relative
             .windows
             .iter()

@@ -4,8 +4,34 @@
 use serde::{Deserialize, Serialize};
 
 use super::shake::Shake;
+use crate::error::{Error, Result};
 use crate::random::Random;
 use crate::tensor::{Float, Tensor, Var};
+
+/// What is made of the photometric errors of a pixel's sources.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "cli", derive(clap::ValueEnum))]
+pub enum Reprojection {
+    /// The smallest: a source that does not see the pixel is left out (Monodepth2, section 3.2).
+    #[default]
+    Minimum,
+    /// Their mean, as before Monodepth2. Auto-masking then takes the smaller of two means: of the warped sources, and of
+    /// the unwarped ones.
+    Average,
+}
+
+/// The size at which the disparities of the smaller scales are compared.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "cli", derive(clap::ValueEnum))]
+pub enum Scales {
+    /// All are resized to full size (Monodepth2, section 3.3).
+    #[default]
+    Full,
+    /// Each at its own, with target, sources and camera of that size, as in Monodepth.
+    Own,
+}
 
 /// The settings of the loss.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -15,8 +41,12 @@ pub struct LossConfig {
     pub min_depth: f64,
     /// Disparity 0 means this depth.
     pub max_depth: f64,
-    /// The share of SSIM in the photometric error; the rest is the absolute difference.
+    /// The share of SSIM in the photometric error; the rest is the absolute difference. With 0 SSIM is not computed.
     pub ssim: f64,
+    /// What is made of the errors of a pixel's sources.
+    pub reprojection: Reprojection,
+    /// The size at which smaller disparities are compared.
+    pub scales: Scales,
     /// The weight of the smoothness term at full size; halved with every scale.
     pub smoothness: f64,
     /// Whether pixels that an unwarped neighbour explains better are left out.
@@ -39,6 +69,8 @@ impl Default for LossConfig {
             min_depth: 0.1,
             max_depth: 100.0,
             ssim: 0.85,
+            reprojection: Reprojection::Minimum,
+            scales: Scales::Full,
             smoothness: 1e-3,
             auto_mask: true,
             auto_mask_after: 0,
@@ -49,12 +81,37 @@ impl Default for LossConfig {
     }
 }
 
+impl LossConfig {
+    /// Checks that a loss can be computed.
+    ///
+    /// # Errors
+    /// Names the field that cannot be used: depths that are no range, a share outside [0, 1], a negative weight.
+    pub fn check(&self) -> Result<()> {
+        let refuse = |field: &str, message: String| Err(Error::setting(format!("loss.{field}"), message));
+        if !(self.min_depth > 0.0 && self.min_depth < self.max_depth && self.max_depth.is_finite()) {
+            let message = format!("{} to {} is no range of depths above 0", self.min_depth, self.max_depth);
+            return refuse("min_depth", message);
+        }
+        if !(0.0..=1.0).contains(&self.ssim) {
+            return refuse("ssim", format!("{} is not a share from 0 to 1", self.ssim));
+        }
+        for (field, weight) in [("smoothness", self.smoothness), ("tie_break", self.tie_break)] {
+            if !(weight >= 0.0 && weight.is_finite()) {
+                return refuse(field, format!("{weight} is not a number from 0"));
+            }
+        }
+        Ok(())
+    }
+}
+
 /// What the loss compares: plain images, not the jittered ones that the networks see.
 pub struct Views<T: Float> {
     /// The target at 1, 1/2, 1/4, 1/8 of its size, `[B, h, w, 3]`.
     pub pyramid: Vec<Var<T>>,
     /// The neighbours, `[B, H, W, 3]`.
     pub sources: Vec<Var<T>>,
+    /// The neighbours at 1/2, 1/4, 1/8 of their size, needed for [`Scales::Own`] alone: for each scale all sources.
+    pub smaller_sources: Vec<Vec<Var<T>>>,
     /// fx, fy, cx, cy of each sample, in pixels.
     pub intrinsics: Vec<[f64; 4]>,
 }
@@ -104,6 +161,9 @@ pub fn photometric<T: Float>(prediction: &Var<T>, target: &Var<T>, config: &Loss
 /// target camera into each source's.
 ///
 /// With `ties`, equal errors are told apart by noise; without, the first candidate wins.
+///
+/// # Panics
+/// If [`Scales::Own`] is asked for without the smaller sources.
 #[track_caller]
 pub fn loss<T: Float>(
     disparities: &[Var<T>],
@@ -112,34 +172,40 @@ pub fn loss<T: Float>(
     config: &LossConfig,
     mut ties: Option<(&TieBreak<T>, &mut Random)>,
 ) -> Loss<T> {
-    let target = &views.pyramid[0];
-    let [_, height, width, _] = target.shape().nhwc().expect("an image");
-    let still: Vec<Var<T>> = views.sources.iter().map(|s| photometric(s, target, config)).collect();
-    let unwarped = mean_minimum(&still);
+    let [_, height, width, _] = views.pyramid[0].shape().nhwc().expect("an image");
+    let still = |sources: &[Var<T>], target: &Var<T>| -> Vec<Var<T>> {
+        let errors = sources.iter().map(|s| photometric(s, target, config)).collect();
+        config.reprojection.candidates(errors)
+    };
+    let unwarped = still(&views.sources, &views.pyramid[0]);
 
     let mut parts = Vec::new();
     let (mut sum_photometric, mut sum_warped, mut sum_smoothness, mut sum_mask) = (0.0, 0.0, 0.0, 0.0);
     for (scale, disparity) in disparities.iter().enumerate() {
-        let full = match scale {
-            0 => disparity.clone(),
-            _ => disparity.resize_bilinear(height, width, false),
+        let own = scale > 0 && config.scales == Scales::Own;
+        let (target, sources) = match own {
+            true => (&views.pyramid[scale], views.smaller_sources.get(scale - 1).expect("sources of every scale")),
+            false => (&views.pyramid[0], &views.sources),
         };
-        let depth = full.disparity_to_depth(config.min_depth, config.max_depth);
-        let mut candidates: Vec<Var<T>> = views
-            .sources
-            .iter()
-            .zip(transforms)
-            .map(|(source, transform)| {
-                let warped = source.warp(&depth, transform, &views.intrinsics, config.consistent_grid);
-                photometric(&warped, target, config)
-            })
-            .collect();
+        let size = if own { 0.5f64.powi(scale as i32) } else { 1.0 };
+        let intrinsics: Vec<_> = views.intrinsics.iter().map(|k| k.map(|pixels| size * pixels)).collect();
+        let sized = match own || scale == 0 {
+            true => disparity.clone(),
+            false => disparity.resize_bilinear(height, width, false),
+        };
+        let depth = sized.disparity_to_depth(config.min_depth, config.max_depth);
+        let errors = sources.iter().zip(transforms).map(|(source, transform)| {
+            let warped = source.warp(&depth, transform, &intrinsics, config.consistent_grid);
+            photometric(&warped, target, config)
+        });
+        let mut candidates = config.reprojection.candidates(errors.collect());
         let warped = candidates.len();
         sum_warped += mean_minimum(&candidates);
         if config.auto_mask {
-            candidates.extend(still.iter().map(|error| match &mut ties {
+            let unwarped = if own { still(sources, target) } else { unwarped.clone() };
+            candidates.extend(unwarped.into_iter().map(|error| match &mut ties {
                 Some((ties, random)) => Var::constant(ties.add(error.value(), random)),
-                None => error.clone(),
+                None => error,
             }));
         }
         let (error, winner) = Var::min_reprojection(&candidates.iter().collect::<Vec<_>>());
@@ -157,9 +223,22 @@ pub fn loss<T: Float>(
         total,
         photometric: sum_photometric / scales,
         warped: sum_warped / scales,
-        unwarped,
+        unwarped: mean_minimum(&unwarped),
         smoothness: sum_smoothness / scales,
         auto_mask: sum_mask / scales,
+    }
+}
+
+impl Reprojection {
+    /// What of the error maps of a group of sources stands for election in each pixel.
+    fn candidates<T: Float>(self, errors: Vec<Var<T>>) -> Vec<Var<T>> {
+        let share = 1.0 / errors.len().max(1) as f64;
+        match self {
+            Reprojection::Minimum => errors,
+            Reprojection::Average => {
+                errors.into_iter().reduce(|a, b| a + b).map(|sum| sum.affine(share, 0.0)).into_iter().collect()
+            }
+        }
     }
 }
 
@@ -181,6 +260,7 @@ mod tests {
         let views = Views {
             pyramid: vec![image.clone().into()],
             sources: vec![image.clone().into(), image.into()],
+            smaller_sources: vec![],
             intrinsics: vec![[18.0, 60.0, 16.0, 16.0]],
         };
         let disparity = Var::constant(Tensor::full([1, 32, 32, 1], 0.3));
@@ -189,5 +269,81 @@ mod tests {
         let found = loss(&[disparity], &[still.clone(), still], &views, &config, None);
         assert!(found.unwarped.abs() < 1e-12 && found.warped < 1e-6, "{} {}", found.unwarped, found.warped);
         assert!(found.smoothness.abs() < 1e-12, "a constant disparity is smooth");
+    }
+
+    fn image(size: [usize; 4], seed: u64) -> Var<f64> {
+        let mut random = Random::new(seed, 0);
+        Var::constant(Tensor::build(size, |out| out.iter_mut().for_each(|x| *x = random.unit())))
+    }
+
+    /// Two scales of noise, two sources that have moved.
+    fn noise() -> (Vec<Var<f64>>, Vec<Var<f64>>, Views<f64>) {
+        let (full, half) = ([2, 16, 24, 3], [2, 8, 12, 3]);
+        let views = Views {
+            pyramid: vec![image(full, 1), image(half, 2)],
+            sources: vec![image(full, 3), image(full, 4)],
+            smaller_sources: vec![vec![image(half, 5), image(half, 6)]],
+            intrinsics: vec![[14.0, 18.0, 12.0, 8.0], [15.0, 17.0, 11.0, 8.5]],
+        };
+        let disparities = vec![image([2, 16, 24, 1], 7), image([2, 8, 12, 1], 8)];
+        let pose = |x: f64| {
+            let numbers = |x: f64| Var::constant(Tensor::from_vec([2, 3], [x, -x, 0.5 * x].repeat(2)));
+            Var::pose_matrix(&numbers(0.1 * x), &numbers(x), false)
+        };
+        (disparities, vec![pose(0.1), pose(-0.07)], views)
+    }
+
+    #[test]
+    fn the_average_is_that_of_the_losses_of_single_sources() {
+        let (disparities, transforms, views) = noise();
+        let config = LossConfig { auto_mask: false, smoothness: 0.0, ..LossConfig::default() };
+        let average = LossConfig { reprojection: Reprojection::Average, ..config };
+        let of = |which: usize| {
+            let views = Views {
+                pyramid: views.pyramid.clone(),
+                sources: vec![views.sources[which].clone()],
+                smaller_sources: vec![],
+                intrinsics: views.intrinsics.clone(),
+            };
+            loss(&disparities, &transforms[which..=which], &views, &config, None).photometric
+        };
+        let found = loss(&disparities, &transforms, &views, &average, None);
+        let expected = 0.5 * (of(0) + of(1));
+        assert!((found.photometric - expected).abs() < 1e-12, "{} for {expected}", found.photometric);
+        assert!((found.warped - expected).abs() < 1e-12 && found.auto_mask == 1.0);
+        // The smaller of two means, pixel by pixel, is at most the mean of either.
+        let masked = loss(&disparities, &transforms, &views, &LossConfig { auto_mask: true, ..average }, None);
+        assert!(masked.photometric < masked.warped.min(masked.unwarped), "{}", masked.photometric);
+        assert!(loss(&disparities, &transforms, &views, &config, None).photometric < expected, "the minimum is less");
+    }
+
+    #[test]
+    fn a_scale_at_its_own_size_is_a_full_size_of_smaller_images() {
+        let (disparities, transforms, views) = noise();
+        let own = LossConfig { scales: Scales::Own, smoothness: 0.0, ..LossConfig::default() };
+        let smaller = Views {
+            pyramid: views.pyramid[1..].to_vec(),
+            sources: views.smaller_sources[0].clone(),
+            smaller_sources: vec![],
+            intrinsics: views.intrinsics.iter().map(|k| k.map(|pixels| 0.5 * pixels)).collect(),
+        };
+        let first = loss(&disparities[..1], &transforms, &views, &own, None).photometric;
+        let second = loss(&disparities[1..], &transforms, &smaller, &own, None).photometric;
+        let found = loss(&disparities, &transforms, &views, &own, None).photometric;
+        assert!((found - 0.5 * (first + second)).abs() < 1e-12, "{found} for {first} and {second}");
+        let full = loss(&disparities, &transforms, &views, &LossConfig { scales: Scales::Full, ..own }, None);
+        assert!((found - full.photometric).abs() > 1e-6, "not the same as at full size");
+    }
+
+    #[test]
+    fn settings_that_cannot_be_are_named() {
+        let refused = |config: LossConfig| config.check().unwrap_err().to_string();
+        let usual = LossConfig::default();
+        usual.check().unwrap();
+        assert!(refused(LossConfig { ssim: 1.5, ..usual }).contains("loss.ssim: 1.5"));
+        assert!(refused(LossConfig { ssim: f64::NAN, ..usual }).contains("loss.ssim"));
+        assert!(refused(LossConfig { min_depth: 0.0, ..usual }).contains("loss.min_depth"));
+        assert!(refused(LossConfig { min_depth: 200.0, ..usual }).contains("200 to 100"));
+        assert!(refused(LossConfig { smoothness: -1.0, ..usual }).contains("loss.smoothness"));
     }
 }

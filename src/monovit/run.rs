@@ -12,7 +12,7 @@ use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 
-use super::config::{Config, Preset};
+use super::config::{Ablation, Config, Preset};
 use super::evaluation::{Evaluation, Predictor, evaluate, evaluate_mean_map};
 use super::loss::LossConfig;
 use super::metrics::{MeanMap, Metrics, Protocol, Scale};
@@ -71,6 +71,9 @@ pub struct RunConfig {
     pub log_every: u64,
     /// The whole state is written, and the weights are validated, every so many steps.
     pub checkpoint_every: u64,
+    /// What is taken away from the named sizes.
+    #[serde(default)]
+    pub ablation: Ablation,
     /// Augmentation.
     pub augment: Augment,
     /// The loss.
@@ -99,6 +102,7 @@ impl RunConfig {
             initial_disparity: Some(0.15),
             log_every: 10,
             checkpoint_every: 200,
+            ablation: Ablation::default(),
             augment: Augment { flip: true, jitter: false },
             loss: LossConfig {
                 auto_mask_after: 300,
@@ -139,7 +143,7 @@ impl RunConfig {
 
     /// The sizes of the networks.
     pub fn model(&self) -> Config {
-        self.preset.config()
+        self.ablation.apply(self.preset.config())
     }
 
     /// Checks what can be checked without data.
@@ -155,7 +159,8 @@ impl RunConfig {
         if self.steps == 0 {
             return Err(Error::setting("--steps", "at least 1"));
         }
-        Ok(())
+        self.loss.check()?;
+        self.ablation.check(&self.preset.config())
     }
 
     /// What a safetensors file says about itself: this configuration, as JSON under `parallax`.
@@ -326,7 +331,9 @@ impl Run {
 
     /// A run that was interrupted, where it stood.
     pub fn resume(folder: &Path) -> Result<Self> {
-        let config = read_config(&folder.join("config.toml"))?;
+        let path = folder.join("config.toml");
+        let config = read_config(&path)?;
+        config.check().map_err(|e| Error::file(&path, e.to_string()))?;
         let trainer = Trainer::new(config.model(), config.optim, config.loss, config.seed);
         let mut run = Self::of(folder, config, trainer);
         let state = run.state_file();

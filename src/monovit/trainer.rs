@@ -6,7 +6,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::config::Config;
-use super::loss::{Loss, LossConfig, TieBreak, Views, loss};
+use super::loss::{Loss, LossConfig, Scales, TieBreak, Views, loss};
 use super::model::MonoVit;
 use super::shake::Lesson;
 use crate::data::batch::Batch;
@@ -78,10 +78,12 @@ pub struct Trainer {
 }
 
 /// What the loss compares in a batch.
-fn views(batch: &Batch) -> Views<f32> {
+fn views(batch: &Batch, scales: Scales) -> Views<f32> {
+    let smaller = if scales == Scales::Own { batch.smaller_sources() } else { Vec::new() };
     Views {
         pyramid: batch.pyramid.iter().cloned().map(Var::constant).collect(),
         sources: batch.sources.iter().cloned().map(Var::constant).collect(),
+        smaller_sources: smaller.into_iter().map(|s| s.into_iter().map(Var::constant).collect()).collect(),
         intrinsics: batch.intrinsics.clone(),
     }
 }
@@ -143,7 +145,8 @@ impl Trainer {
         let transforms = self.model.transforms(&c, &prev, &target, &next);
         let mut random = Random::new(self.seed, TIE_STREAM.wrapping_add(step));
         let config = LossConfig { auto_mask: self.loss.auto_mask && step >= self.loss.auto_mask_after, ..self.loss };
-        let found = loss(&disparities, &transforms, &views(batch), &config, Some((&self.ties, &mut random)));
+        let found =
+            loss(&disparities, &transforms, &views(batch, config.scales), &config, Some((&self.ties, &mut random)));
         (c, found)
     }
 
@@ -229,7 +232,7 @@ impl Trainer {
             let [prev, target, next] = batch.seen.each_ref().map(|t| Var::constant(t.clone()));
             let disparities = self.model.disparities(&c, &target);
             let transforms = self.model.transforms(&c, &prev, &target, &next);
-            loss(&disparities[..1], &transforms, &views(batch), &self.loss, None).photometric
+            loss(&disparities[..1], &transforms, &views(batch, Scales::Full), &self.loss, None).photometric
         });
         let errors: Vec<f64> = errors.collect();
         errors.iter().sum::<f64>() / errors.len().max(1) as f64

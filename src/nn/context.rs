@@ -27,6 +27,8 @@ pub struct Context<T: Float> {
     moved: RefCell<HashMap<ParamId, Tensor<T>>>,
     /// The dice of DropPath.
     random: RefCell<Random>,
+    /// What modules showed, by name; `None` if nobody looks.
+    seen: Option<RefCell<HashMap<String, Tensor<T>>>>,
 }
 
 impl<T: Float> Context<T> {
@@ -52,7 +54,24 @@ impl<T: Float> Context<T> {
     }
 
     fn with(vars: Vec<Var<T>>, mode: Mode, random: Random) -> Self {
-        Context { vars, mode, moved: RefCell::default(), random: RefCell::new(random) }
+        Context { vars, mode, moved: RefCell::default(), random: RefCell::new(random), seen: None }
+    }
+
+    /// The same pass, looked at: what modules [`observe`](Context::observe) is kept.
+    pub fn observed(self) -> Self {
+        Context { seen: Some(RefCell::default()), ..self }
+    }
+
+    /// Shows an intermediate value to whoever looks, under the path of its module. Nothing happens if nobody does.
+    pub fn observe(&self, name: &str, value: &Var<T>) {
+        if let Some(seen) = &self.seen {
+            seen.borrow_mut().insert(name.to_owned(), value.value().clone());
+        }
+    }
+
+    /// Takes what the module of this name showed last, if this pass is [`observed`](Context::observed).
+    pub fn take_observed(&self, name: &str) -> Option<Tensor<T>> {
+        self.seen.as_ref()?.borrow_mut().remove(name)
     }
 
     /// A parameter as a variable.

@@ -199,6 +199,11 @@ impl<'a, T: Float> Builder<'a, T> {
         Builder { params: self.params, random: self.random, path, start: self.start }
     }
 
+    /// Where the builder stands: what the names of its parameters begin with.
+    pub fn path(&self) -> &str {
+        &self.path
+    }
+
     fn join(&self, name: impl std::fmt::Display) -> String {
         if self.path.is_empty() { name.to_string() } else { format!("{}.{name}", self.path) }
     }

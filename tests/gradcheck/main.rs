@@ -2,8 +2,10 @@
 //!
 //! `checks` is what every case must pass, `every_op` runs it over the registry, `mutants` over gradients that are wrong
 //! on purpose. `regressions` are bugs of other libraries with the inputs that exposed them (`CATALOGUE.md` lists them),
-//! `regimes` whole ranges of sizes and geometries; `model_path` and `whole_model` hold the network to the ops.
+//! `regimes` whole ranges of sizes and geometries; `model_path` and `whole_model` hold the network to the ops,
+//! `ablations` what is left when parts of it are taken away.
 
+mod ablations;
 mod catalogue;
 mod checks;
 mod every_op;

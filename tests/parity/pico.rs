@@ -65,6 +65,7 @@ impl<T: Float> Pico<T> {
         Views {
             pyramid: pyramid.map(|n| self.reference.map(n).into()).into(),
             sources: ["in/prev", "in/next"].map(|n| self.reference.map(n).into()).into(),
+            smaller_sources: Vec::new(),
             intrinsics: vec![intrinsics; 2],
         }
     }

@@ -1,0 +1,69 @@
+//! The switches of the paper's ablation study, as flags.
+
+use parallax::Result;
+use parallax::monovit::loss::{LossConfig, Reprojection, Scales};
+use parallax::monovit::{Ablation, Config, Preset};
+
+/// What is taken away from the networks.
+#[derive(clap::Args, Clone)]
+#[command(next_help_heading = "Ablations of the networks")]
+pub struct Networks {
+    /// At most so many transformer paths a stage: 2, 1 or 0.
+    #[arg(long, value_name = "N")]
+    transformer_paths: Option<usize>,
+    /// Without the CNN path beside the transformer paths.
+    #[arg(long)]
+    no_cnn_path: bool,
+    /// Without the decoder's channel attention.
+    #[arg(long)]
+    no_decoder_attention: bool,
+    /// The largest DropPath probability, instead of the size's own.
+    #[arg(long, value_name = "PROBABILITY")]
+    drop_path: Option<f64>,
+}
+
+impl Networks {
+    /// Takes away what the flags say.
+    pub fn apply(&self, ablation: &mut Ablation) {
+        ablation.transformer_paths = self.transformer_paths.or(ablation.transformer_paths);
+        ablation.cnn_path &= !self.no_cnn_path;
+        ablation.decoder_attention &= !self.no_decoder_attention;
+        ablation.drop_path = self.drop_path.or(ablation.drop_path);
+    }
+
+    /// What is left of a named size.
+    pub fn config(&self, preset: Preset) -> Result<Config> {
+        let mut ablation = Ablation::default();
+        self.apply(&mut ablation);
+        ablation.check(&preset.config())?;
+        Ok(ablation.apply(preset.config()))
+    }
+}
+
+/// What is changed in the loss.
+#[derive(clap::Args, Clone)]
+#[command(next_help_heading = "Ablations of the loss")]
+pub struct Loss {
+    /// Keep the pixels that an unwarped neighbour explains better.
+    #[arg(long)]
+    no_auto_mask: bool,
+    /// What is made of the errors of a pixel's sources.
+    #[arg(long)]
+    reprojection: Option<Reprojection>,
+    /// The size at which smaller disparities are compared.
+    #[arg(long)]
+    scales: Option<Scales>,
+    /// The share of SSIM in the photometric error; 0 for none.
+    #[arg(long, value_name = "SHARE")]
+    ssim: Option<f64>,
+}
+
+impl Loss {
+    /// Changes what the flags say.
+    pub fn apply(&self, loss: &mut LossConfig) {
+        loss.auto_mask &= !self.no_auto_mask;
+        loss.reprojection = self.reprojection.unwrap_or(loss.reprojection);
+        loss.scales = self.scales.unwrap_or(loss.scales);
+        loss.ssim = self.ssim.unwrap_or(loss.ssim);
+    }
+}
