@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::shake::Shake;
 use crate::random::Random;
-use crate::tensor::{Float, Tensor, Var};
+use crate::tensor::{Float, Tensor, Var, trace};
 
 /// The settings of the loss.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -138,7 +138,9 @@ pub fn loss<T: Float>(
         sum_warped += mean_minimum(&candidates);
         if config.auto_mask {
             candidates.extend(still.iter().map(|error| match &mut ties {
-                Some((ties, random)) => Var::constant(ties.add(error.value(), random)),
+                Some((ties, random)) => {
+                    Var::constant(trace::phase("noise against ties", || ties.add(error.value(), random)))
+                }
                 None => error.clone(),
             }));
         }
@@ -147,7 +149,8 @@ pub fn loss<T: Float>(
         let weight = config.smoothness / (1u64 << scale) as f64;
         sum_photometric += error.value().item().f64();
         sum_smoothness += weight * smoothness.value().item().f64();
-        let kept = winner.data().iter().filter(|w| w.f64() < warped as f64).count();
+        let count = || winner.data().iter().filter(|w| w.f64() < warped as f64).count();
+        let kept = trace::phase("pixels that auto-masking leaves", count);
         sum_mask += kept as f64 / winner.len().max(1) as f64;
         parts.push(error + smoothness.affine(weight, 0.0));
     }
