@@ -34,7 +34,9 @@ fn named(name: &str) -> Result<Arch> {
         ("avx2", _) => pulp::x86::V3::try_new().map(Arch::V3),
         #[cfg(target_arch = "x86_64")]
         ("avx512", Arch::V4(_)) => Some(best),
-        ("avx512" | "avx2", _) => None,
+        #[cfg(not(target_arch = "x86_64"))]
+        ("avx2", _) => None,
+        ("avx512", _) => None,
         _ => {
             return Err(Error::setting(
                 VARIABLE,

@@ -12,7 +12,7 @@ use serde::Serialize;
 
 use super::sizes::Sizes;
 use breakdown::Row;
-use job::{Conv, Job, Measured, Network};
+use job::{Conv, Measured, Network};
 
 #[derive(clap::Args)]
 pub struct Args {
