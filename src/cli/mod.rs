@@ -45,7 +45,7 @@ enum Command {
     Attention(attention::Args),
     /// Check every op's gradient against finite differences, now, on this machine.
     Gradcheck(gradcheck::Args),
-    /// Time a training step or an inference, op by op.
+    /// Time a training step or an inference, op by op, and against what this machine could do.
     Bench(bench::Args),
     /// Count parameters, arithmetic and memory before you start.
     Info(info::Args),
@@ -56,7 +56,8 @@ enum Command {
 /// Runs the program.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
-    let result = start_threads(cli.threads).and_then(|()| match cli.command {
+    let ready = parallax::tensor::simd::level().and_then(|_| start_threads(cli.threads));
+    let result = ready.and_then(|()| match cli.command {
         Command::Train(args) => train::run(args),
         Command::Eval(args) => eval::run(args),
         Command::Predict(args) => predict::run(args),

@@ -6,7 +6,7 @@ use super::encoder::Encoder;
 use super::pose::{PoseDecoder, PoseEncoder};
 use crate::nn::{Builder, Context, Folded, Params};
 use crate::random::Random;
-use crate::tensor::{Float, Tensor, Var, parallel};
+use crate::tensor::{Float, Tensor, Var, trace};
 
 /// Depth encoder and decoder, pose encoder and decoder: `encoder`, `depth`, `pose_encoder`, `pose` in a checkpoint.
 #[derive(Clone, Debug)]
@@ -56,15 +56,17 @@ impl MonoVit {
         let picture = |i: usize| {
             let numbers = &images.data()[i * h * w * channels..][..h * w * channels];
             let image = Tensor::build([1, h, w, channels], |out| out.copy_from_slice(numbers));
-            let scales = self.disparities(&Context::folded(params), &Var::constant(image));
+            let c = Context::folded(params);
+            let scales = self.disparities(&c, &Var::constant(image));
+            trace::phase("freeing", || drop(c));
             scales.into_iter().map(Var::into_value).collect::<Vec<_>>()
         };
-        let mut pictures = parallel::map(count, usize::MAX, picture);
+        let mut pictures = trace::map(count, picture);
         if count == 1 {
             return pictures.swap_remove(0);
         }
-        let scales = 0..4;
-        scales.map(|s| Tensor::stack(&pictures.iter().map(|p| &p[s]).collect::<Vec<_>>())).collect()
+        let scale = |s: usize| Tensor::stack(&pictures.iter().map(|p| &p[s]).collect::<Vec<_>>());
+        trace::phase("pictures into a batch", || (0..4).map(scale).collect())
     }
 
     /// Disparities from the encoder's maps.

@@ -171,7 +171,7 @@ impl Trainer {
         // From here on nobody else holds the weights: they are changed in place.
         let moved = c.into_moved();
         let bound = if self.optim.clip > 0.0 { self.optim.clip } else { f64::INFINITY };
-        let grad_norm = clip_norm(&mut gradients, bound);
+        let grad_norm = trace::phase("norm of the gradients", || clip_norm(&mut gradients, bound));
         if !grad_norm.is_finite() {
             let bad = self.params.iter().zip(&gradients).find(|(_, g)| g.as_ref().is_some_and(|g| !g.is_finite()));
             let name = bad.map_or("of a parameter", |((_, p), _)| p.name());
@@ -182,7 +182,7 @@ impl Trainer {
         let factor = self.optim.schedule.factor(step);
         let learning_rates = [self.optim.encoder_rate, self.optim.rate, self.optim.pose_rate].map(|r| r * factor);
         let decay = self.optim.decay;
-        self.adamw.step(&mut self.params, &gradients, |name| {
+        let group = |name: &str| {
             let which = if name.starts_with("encoder.") {
                 0
             } else if name.starts_with("depth.") {
@@ -191,14 +191,17 @@ impl Trainer {
                 2
             };
             Group { learning_rate: learning_rates[which], decay }
+        };
+        trace::phase("adamw", || self.adamw.step(&mut self.params, &gradients, group));
+        trace::phase("running statistics", || {
+            for (id, value) in moved {
+                self.params.set(id, value);
+            }
         });
-        for (id, value) in moved {
-            self.params.set(id, value);
-        }
         if let Some(average) = &mut self.average {
-            average.update(&self.params, step);
+            trace::phase("weight averaging", || average.update(&self.params, step));
         }
-        Ok(StepReport {
+        let report = StepReport {
             step,
             loss: total,
             photometric: found.photometric,
@@ -208,7 +211,9 @@ impl Trainer {
             auto_mask: found.auto_mask,
             learning_rates,
             grad_norm,
-        })
+        };
+        trace::phase("freeing", move || drop((all, gradients, objective, found, tape)));
+        Ok(report)
     }
 
     /// Runs the forward pass once more, looking at every number.

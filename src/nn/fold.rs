@@ -22,9 +22,8 @@ impl<T: Float> Folded<T> {
             let (gamma, beta) = (of(bn.weight), of(bn.bias));
             let (mean, var) = (of(bn.running_mean), of(bn.running_var));
             // In f64: the product of rounded factors would be rounded three times.
-            let scale: Vec<f64> = (gamma.iter().zip(var))
-                .map(|(g, v)| g.f64() / (v.f64() + BatchNorm::EPS).sqrt())
-                .collect();
+            let scale: Vec<f64> =
+                (gamma.iter().zip(var)).map(|(g, v)| g.f64() / (v.f64() + BatchNorm::EPS).sqrt()).collect();
             for row in folded.value_mut(*weight).data_mut().chunks_exact_mut(scale.len()) {
                 row.iter_mut().zip(&scale).for_each(|(w, s)| *w = T::of(w.f64() * s));
             }

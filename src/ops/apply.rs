@@ -1,9 +1,9 @@
 //! `apply`: the one function that runs an op and makes its node. Nothing else can, so nothing can cut the graph silently.
 
-use std::time::Instant;
+use std::time::Duration;
 
 use super::op::{Needs, Op};
-use super::trace;
+use crate::tensor::trace::{self, Entry, Work};
 use crate::tensor::{Float, GradSink, Shape, Tape, Tensor, Upstream, Var};
 
 /// Runs an op with one output (auxiliary ones are dropped).
@@ -30,10 +30,9 @@ pub fn apply<T: Float, O: Op<T>>(op: O, inputs: &[&Var<T>]) -> Vec<Var<T>> {
     let needs = Needs(inputs.iter().map(|v| v.is_tracked()).collect());
     let values: Vec<&Tensor<T>> = inputs.iter().map(|v| v.value()).collect();
 
-    let entry = trace::begin(|| (O::NAME, op.algo(&shapes), op.flops(&shapes)));
-    let start = Instant::now();
+    let running = trace::begin_forward(|| entry::<T, O>(&op, &shapes, &expected, &needs));
     let (mut outputs, saved) = op.forward(&values, &needs);
-    trace::end_forward(entry, start, &outputs);
+    let place = trace::end_forward(running, &outputs);
 
     debug_assert!(outputs.iter().map(Tensor::shape).eq(&expected), "{}: the shape rule says {expected:?}", O::NAME);
     let auxiliary = outputs.split_off(outputs.len() - op.auxiliary());
@@ -42,15 +41,36 @@ pub fn apply<T: Float, O: Op<T>>(op: O, inputs: &[&Var<T>]) -> Vec<Var<T>> {
         Some(tape) => {
             let slots = inputs.iter().map(|v| v.slot()).collect();
             let backward = move |upstream: Upstream<T>, sink: &mut GradSink<'_, T>| {
-                let start = Instant::now();
+                let running = trace::begin_backward(place);
                 op.backward(saved, upstream, sink);
-                trace::end_backward(entry, start);
+                trace::end_backward(running);
             };
             tape.record(slots, outputs, Box::new(backward))
         }
     };
     vars.extend(auxiliary.into_iter().map(Var::constant));
     vars
+}
+
+/// What is said of an op that is about to run.
+fn entry<T: Float, O: Op<T>>(op: &O, inputs: &[Shape], outputs: &[Shape], needs: &Needs) -> Entry {
+    let flops = op.flops(inputs);
+    let [forward, backward] = op.traffic(inputs, outputs, needs).map(|elements| elements * size_of::<T>() as u64);
+    // The gradients of both factors of a product cost as much as the product each; where only one is wanted, half.
+    let factors = inputs.len().clamp(1, 2);
+    let wanted = (0..factors).filter(|&i| needs.get(i)).count() as u64;
+    let back = Work { flops: 2 * flops * wanted / factors as u64, bytes: if needs.any() { backward } else { 0 } };
+    Entry {
+        op: O::NAME,
+        algo: op.algo(inputs),
+        flops,
+        bytes: forward,
+        back,
+        forward: Duration::ZERO,
+        backward: Duration::ZERO,
+        output: outputs.first().copied().unwrap_or_else(|| Shape::new(&[])),
+        finite: true,
+    }
 }
 
 #[track_caller]

@@ -42,6 +42,10 @@ impl<T: Float> Op<T> for Concat {
         Ok(vec![first.with(self.axis, inputs.iter().map(|s| s.dims()[self.axis]).sum())])
     }
 
+    fn traffic(&self, inputs: &[Shape], outputs: &[Shape], needs: &Needs) -> [u64; 2] {
+        super::op::traffic_without_inputs(inputs, outputs, needs)
+    }
+
     fn forward(&self, inputs: &[&Tensor<T>], _: &Needs) -> (Vec<Tensor<T>>, Self::Saved) {
         let runs: Vec<usize> = inputs.iter().map(|x| self.run(x.shape())).collect();
         let total: usize = runs.iter().sum();

@@ -22,7 +22,8 @@ pub enum Activation {
 
 impl Activation {
     /// All of them.
-    pub(super) const ALL: [Activation; 4] = [Activation::None, Activation::Relu, Activation::Hardswish, Activation::Elu];
+    pub(super) const ALL: [Activation; 4] =
+        [Activation::None, Activation::Relu, Activation::Hardswish, Activation::Elu];
 
     /// A name for kernel paths.
     pub(super) fn name(self) -> &'static str {
@@ -102,9 +103,21 @@ impl<T: Float> Finish<T> {
     pub(super) fn run(&self, y: &mut [T]) {
         match self.activation {
             Activation::None => self.run_with(y, |x| x),
-            Activation::Relu => self.run_with(y, #[inline(always)] |x| Relu.f(x)),
-            Activation::Hardswish => self.run_with(y, #[inline(always)] |x| Hardswish.f(x)),
-            Activation::Elu => self.run_with(y, #[inline(always)] |x| Elu.f(x)),
+            Activation::Relu => self.run_with(
+                y,
+                #[inline(always)]
+                |x| Relu.f(x),
+            ),
+            Activation::Hardswish => self.run_with(
+                y,
+                #[inline(always)]
+                |x| Hardswish.f(x),
+            ),
+            Activation::Elu => self.run_with(
+                y,
+                #[inline(always)]
+                |x| Elu.f(x),
+            ),
         }
     }
 
@@ -171,7 +184,13 @@ mod tests {
                         Activation::None => z,
                         Activation::Relu => z.max(0.0),
                         Activation::Hardswish => z * (z + 3.0).clamp(0.0, 6.0) / 6.0,
-                        Activation::Elu => if z > 0.0 { z } else { z.exp_m1() },
+                        Activation::Elu => {
+                            if z > 0.0 {
+                                z
+                            } else {
+                                z.exp_m1()
+                            }
+                        }
                     };
                     assert!((found - expected).abs() < 1e-14, "{activation:?} of {z}: {found} for {expected}");
                 }

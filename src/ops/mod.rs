@@ -7,7 +7,6 @@ mod apply;
 pub mod case;
 mod op;
 pub mod registry;
-pub mod trace;
 
 pub mod activation;
 pub mod batch_norm;
@@ -62,6 +61,7 @@ pub mod upsample_nearest;
 pub mod variance;
 pub mod warp;
 
+pub use crate::tensor::trace;
 pub use apply::{apply, apply1};
 pub use case::{Case, Input};
 pub use conv_transpose2d::ConvTranspose2d;

@@ -34,11 +34,31 @@ pub trait Op<T: Float>: Registered + Checked + Clone + 'static {
         0
     }
 
+    /// The least memory traffic, in elements: of the forward pass, and of the backward pass to the gradients that are
+    /// wanted. Unless an op says otherwise, the first reads its inputs and writes its outputs, the second reads its
+    /// inputs and the outputs' gradients and writes the inputs', each element once.
+    fn traffic(&self, inputs: &[Shape], outputs: &[Shape], needs: &Needs) -> [u64; 2] {
+        let elements = |shapes: &[Shape]| shapes.iter().map(|s| s.len() as u64).sum::<u64>();
+        let once = elements(inputs) + elements(outputs);
+        [once, once + gradients(inputs, needs)]
+    }
+
     /// Computes the outputs, and what the backward pass needs of those inputs whose gradient somebody wants.
     fn forward(&self, inputs: &[&Tensor<T>], needs: &Needs) -> (Vec<Tensor<T>>, Self::Saved);
 
     /// Turns the gradients of the outputs into those of the inputs.
     fn backward(&self, saved: Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>);
+}
+
+/// The [`traffic`](Op::traffic) of an op whose gradient needs none of its inputs, only the outputs' gradients.
+pub(super) fn traffic_without_inputs(inputs: &[Shape], outputs: &[Shape], needs: &Needs) -> [u64; 2] {
+    let elements = |shapes: &[Shape]| shapes.iter().map(|s| s.len() as u64).sum::<u64>();
+    [elements(inputs) + elements(outputs), elements(outputs) + gradients(inputs, needs)]
+}
+
+/// Elements of the gradients that are wanted.
+fn gradients(inputs: &[Shape], needs: &Needs) -> u64 {
+    inputs.iter().enumerate().filter(|&(i, _)| needs.get(i)).map(|(_, s)| s.len() as u64).sum()
 }
 
 /// An op that is in the registry, under its name there; or a [`CustomOp`].

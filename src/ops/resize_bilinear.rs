@@ -97,6 +97,10 @@ impl<T: Float> Op<T> for ResizeBilinear {
         if self.align_corners { "align_corners" } else { "half_pixel" }
     }
 
+    fn traffic(&self, inputs: &[Shape], outputs: &[Shape], needs: &Needs) -> [u64; 2] {
+        super::op::traffic_without_inputs(inputs, outputs, needs)
+    }
+
     fn forward(&self, inputs: &[&Tensor<T>], _: &Needs) -> (Vec<Tensor<T>>, Shape) {
         let x = inputs[0];
         let [_, h, w, c] = x.shape().nhwc().expect("checked by the shape rule");

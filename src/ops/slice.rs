@@ -45,6 +45,12 @@ impl<T: Float> Op<T> for Slice {
         }
     }
 
+    /// Only what is taken is read; every element's gradient is written.
+    fn traffic(&self, inputs: &[Shape], outputs: &[Shape], _: &Needs) -> [u64; 2] {
+        let [all, taken] = [inputs[0].len() as u64, outputs[0].len() as u64];
+        [2 * taken, all + taken]
+    }
+
     fn forward(&self, inputs: &[&Tensor<T>], _: &Needs) -> (Vec<Tensor<T>>, Shape) {
         let x = inputs[0];
         let (run, range) = self.run(x.shape());

@@ -29,6 +29,10 @@ impl<T: Float> Op<T> for UpsampleNearest {
         if self.scale == 2 { "by_2" } else { "direct" }
     }
 
+    fn traffic(&self, inputs: &[Shape], outputs: &[Shape], needs: &Needs) -> [u64; 2] {
+        super::op::traffic_without_inputs(inputs, outputs, needs)
+    }
+
     fn forward(&self, inputs: &[&Tensor<T>], _: &Needs) -> (Vec<Tensor<T>>, Shape) {
         let (x, s) = (inputs[0], self.scale);
         let [_, h, w, c] = x.shape().nhwc().expect("checked by the shape rule");

@@ -12,6 +12,7 @@
 //! | [`gemm`] | matrix products (faer) |
 //! | [`parallel`] | threads, with the same bits for any number of them |
 //! | [`simd`] | run-time choice of instruction set |
+//! | [`trace`] | what ran, and how long |
 
 mod data;
 pub mod float;
@@ -23,6 +24,7 @@ pub mod pool;
 pub mod shape;
 pub mod simd;
 pub mod tape;
+pub mod trace;
 pub mod var;
 
 pub use data::Tensor;

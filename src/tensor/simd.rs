@@ -2,12 +2,71 @@
 //!
 //! A loop vectorises where it runs over zipped iterators (indexing leaves bounds checks in, and is ten times slower),
 //! and fuses multiplications with additions only where `mul_add` says so.
+//!
+//! The environment variable `PARALLAX_SIMD`, read once, holds these kernels to a lower level than the machine has
+//! (`avx512`, `avx2`, `scalar`): how a machine with AVX-512 checks what others run. It does not reach matrix products,
+//! whose instruction set faer chooses by itself.
 
 use std::sync::LazyLock;
 
 use pulp::{Arch, Simd, WithSimd};
 
-static ARCH: LazyLock<Arch> = LazyLock::new(Arch::new);
+use crate::error::{Error, Result};
+
+static ARCH: LazyLock<Arch> = LazyLock::new(|| chosen().unwrap_or_default());
+
+/// The variable that holds kernels to a lower level.
+const VARIABLE: &str = "PARALLAX_SIMD";
+
+/// The level that the environment asks for, or the best of this machine.
+fn chosen() -> Result<Arch> {
+    match std::env::var(VARIABLE) {
+        Ok(name) => named(&name),
+        Err(_) => Ok(Arch::new()),
+    }
+}
+
+fn named(name: &str) -> Result<Arch> {
+    let best = Arch::new();
+    let found = match (name, best) {
+        ("scalar", _) => Some(Arch::Scalar),
+        #[cfg(target_arch = "x86_64")]
+        ("avx2", _) => pulp::x86::V3::try_new().map(Arch::V3),
+        #[cfg(target_arch = "x86_64")]
+        ("avx512", Arch::V4(_)) => Some(best),
+        #[cfg(not(target_arch = "x86_64"))]
+        ("avx2", _) => None,
+        ("avx512", _) => None,
+        _ => {
+            return Err(Error::setting(
+                VARIABLE,
+                format!("avx512, avx2 or scalar, not {name:?}; unset: the best there is"),
+            ));
+        }
+    };
+    found.ok_or_else(|| Error::setting(VARIABLE, format!("this machine has no {name}: it has {}", label(best))))
+}
+
+fn label(arch: Arch) -> &'static str {
+    match arch {
+        Arch::Scalar => "scalar",
+        #[cfg(target_arch = "x86_64")]
+        Arch::V3(_) => "avx2",
+        #[cfg(target_arch = "x86_64")]
+        Arch::V4(_) => "avx512",
+        _ => "simd",
+    }
+}
+
+/// The instruction set that kernels run on: `avx512`, `avx2`, another machine's `simd`, or `scalar` (the baseline that
+/// the program was compiled for).
+///
+/// # Errors
+/// If `PARALLAX_SIMD` asks for one that there is not; kernels take the best there is in that case.
+pub fn level() -> Result<&'static str> {
+    chosen()?;
+    Ok(label(*ARCH))
+}
 
 /// Runs `kernel` compiled for the best instruction set of this machine.
 ///
@@ -121,4 +180,22 @@ vector!(
 #[inline(always)]
 pub fn dispatch_vector<K: WithSimd>(kernel: K) -> K::Output {
     ARCH.dispatch(kernel)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_level_is_asked_for_by_name() {
+        assert_eq!(label(named("scalar").expect("every machine has it")), "scalar");
+        let best = label(Arch::new());
+        for name in ["avx2", "avx512"] {
+            match named(name) {
+                Ok(arch) => assert_eq!(label(arch), name),
+                Err(e) => assert!(e.to_string().contains(best), "{e}"),
+            }
+        }
+        assert!(named("sse9").is_err_and(|e| e.to_string().starts_with("PARALLAX_SIMD: avx512, avx2 or scalar")));
+    }
 }

@@ -10,6 +10,7 @@ use super::data::Tensor;
 use super::float::Float;
 use super::gradients::{GradSink, Gradients, Upstream};
 use super::shape::Shape;
+use super::trace;
 use super::var::Var;
 
 /// What a node does in the backward pass: turns the gradients of its outputs into those of its inputs.
@@ -129,13 +130,15 @@ impl<T: Float> Tape<T> {
                 empty => *empty = Some(cotangent.clone()),
             }
         }
-        while let Some(node) = nodes.pop() {
-            let upstream: Vec<_> = node.outputs.iter().map(|&slot| slots[slot].take()).collect();
-            if upstream.iter().any(Option::is_some) {
-                let mut sink = GradSink::new(&node.inputs, &mut slots, &shapes);
-                (node.backward)(Upstream(upstream), &mut sink);
+        trace::phase("tape", || {
+            while let Some(node) = nodes.pop() {
+                let upstream: Vec<_> = node.outputs.iter().map(|&slot| slots[slot].take()).collect();
+                if upstream.iter().any(Option::is_some) {
+                    let mut sink = GradSink::new(&node.inputs, &mut slots, &shapes);
+                    (node.backward)(Upstream(upstream), &mut sink);
+                }
             }
-        }
+        });
         Gradients::new(self.clone(), slots)
     }
 }

@@ -85,7 +85,8 @@ impl World {
         let light = Light::new(draw, setback.map(|back| half + 2.2 + back));
         let lane = draw.range(-0.6, 0.6) * (half - 5.5).max(0.0);
         let room = props::nearest_parked(half) - props::HALF_CAR - CLEARANCE - lane.abs();
-        let mut world = World { lane, room, light, solids: Vec::new(), shade: [Vec::new(), Vec::new()], movers: Vec::new() };
+        let mut world =
+            World { lane, room, light, solids: Vec::new(), shade: [Vec::new(), Vec::new()], movers: Vec::new() };
         world.ground(draw, &style);
         for side in [-1.0, 1.0] {
             houses::row(&mut world, draw, &style, side);

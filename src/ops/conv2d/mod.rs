@@ -255,13 +255,7 @@ impl Checked for Conv2d {
             case("side by side, 7x7, stride 2", Conv2d::padded(3).strided(2), [1, 5, 8, 2], [7, 7, 2, 4], false),
             case("side by side, unpadded", Conv2d::default(), [2, 3, 6, 2], [3, 3, 2, 3], true),
             case("side by side, reflected", same.reflecting(), [2, 3, 8, 2], [3, 3, 2, 3], true),
-            case(
-                "side by side, tile and one",
-                Conv2d { tile: 4, ..same },
-                [1, 5, 4, 2],
-                [3, 3, 2, 2],
-                false,
-            ),
+            case("side by side, tile and one", Conv2d { tile: 4, ..same }, [1, 5, 4, 2], [3, 3, 2, 2], false),
             case("many channels", same, [1, 3, 5, 1], [3, 3, 1, 70], false),
             case("empty batch", same, [0, 4, 5, 3], [3, 3, 3, 4], true).flat(),
         ];

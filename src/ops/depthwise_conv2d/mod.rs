@@ -149,11 +149,7 @@ impl Checked for DepthwiseConv2d {
             Case::new("tile less one", tiled(4), [x(&[1, 3, 5, 8]), w(3, 3, 8)]),
             Case::new("a whole tile", tiled(4), [x(&[2, 2, 5, 8]), w(3, 3, 8)]),
             Case::new("tile and one", tiled(4), [x(&[1, 5, 5, 8]), w(3, 3, 8)]),
-            Case::new(
-                "tiles by 2",
-                DepthwiseConv2d { tile: 2, ..op(2, 1) },
-                [x(&[2, 5, 4, 8]), w(3, 3, 8), b(8)],
-            ),
+            Case::new("tiles by 2", DepthwiseConv2d { tile: 2, ..op(2, 1) }, [x(&[2, 5, 4, 8]), w(3, 3, 8), b(8)]),
             Case::new("no image", op(1, 1), [x(&[0, 3, 3, 8]), w(3, 3, 8), b(8)]).flat(),
         ];
         for activation in [Activation::Relu, Activation::Hardswish, Activation::Elu] {

@@ -1,0 +1,34 @@
+//! The training step and the inference of the reduced network as wholes.
+
+use std::hint::black_box;
+
+use criterion::{Criterion, criterion_group, criterion_main};
+use parallax::data::batch::{Augment, batch_of_step};
+use parallax::data::street::{Street, StreetConfig};
+use parallax::monovit::run::RunConfig;
+use parallax::monovit::{Preset, Trainer};
+use parallax::nn::Context;
+use parallax::tensor::Var;
+
+fn benches(c: &mut Criterion) {
+    rayon::ThreadPoolBuilder::new().use_current_thread().build_global().expect("the first pool of this process");
+    let street = Street::render(&StreetConfig { sequences: 1, frames: 6, ..StreetConfig::default() }, None);
+    let mut config = RunConfig::new(Preset::Nano, 1_000_000);
+    // The step as it is for most of the run.
+    config.loss.auto_mask_after = 0;
+    config.loss.shake.keep = 0;
+    let batch = batch_of_step(&street, Augment::default(), 4, 0, 0).expect("a batch");
+    let mut trainer = Trainer::new(config.model(), config.optim, config.loss, 0);
+    let mut group = c.benchmark_group("nano 320x96, batch 4");
+    group.sample_size(10);
+    group.bench_function("inference", |b| {
+        b.iter(|| {
+            let c = Context::inference(&trainer.params);
+            black_box(trainer.model.disparities(&c, &Var::constant(batch.seen[1].clone())))
+        });
+    });
+    group.bench_function("training step", |b| b.iter(|| black_box(trainer.step(&batch).expect("a finite loss"))));
+}
+
+criterion_group!(all, benches);
+criterion_main!(all);
