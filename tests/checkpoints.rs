@@ -480,7 +480,7 @@ fn networks_trained_on_imagenet_are_starts() {
         Start::of(&config).err().expect("refused").to_string()
     };
     let error = nano(Some(&mpvit), None);
-    assert!(error.contains("mpvit.pth") && error.contains("does not fit the preset nano: there are channels 8 16 24 32 instead of 32 48 64 96; these weights are of the preset pico"), "{error}");
+    assert!(error.contains("mpvit.pth") && error.contains("does not fit the preset nano: these weights have channels 8 16 24 32 instead of 32 48 64 96; they are of the preset pico"), "{error}");
     let error = nano(None, Some(&resnet));
     assert!(error.contains("resnet18.pth") && error.contains("pose width 4 instead of 16"), "{error}");
     let error = nano(Some(&resnet), None);
