@@ -175,7 +175,7 @@ fn weights_that_do_not_fit_are_listed() {
     all.push(("teacher.weight".into(), vec![2], vec![0.0; 2]));
     all.push(("fc.weight".into(), vec![2], vec![f32::NAN; 2]));
     write_pth(&file, &all);
-    let error = refusal(&[file.clone()]);
+    let error = refusal(std::slice::from_ref(&file));
     for part in [
         "1 missing (encoder.stem.0.bn.bias)",
         "1 unexpected (teacher.weight)",
@@ -184,7 +184,7 @@ fn weights_that_do_not_fit_are_listed() {
     ] {
         assert!(error.contains(part), "{part}: {error}");
     }
-    let partial = load(&[file.clone()], Need::All, true).expect("what fits");
+    let partial = load(std::slice::from_ref(&file), Need::All, true).expect("what fits");
     let report = &partial.report;
     assert_eq!(
         (&report.missing[..], &report.unexpected[..]),
@@ -207,9 +207,9 @@ fn weights_that_do_not_fit_are_listed() {
         let i = find(&all, "depth.convs.f4.conv_se.bias");
         all[i].2[3] = value;
         write_pth(&file, &all);
-        let error = refusal(&[file.clone()]);
+        let error = refusal(std::slice::from_ref(&file));
         assert!(error.contains(&format!("depth.convs.f4.conv_se.bias holds {word} (element 3 of")), "{error}");
-        assert!(load(&[file.clone()], Need::All, true).is_err(), "not even in part");
+        assert!(load(std::slice::from_ref(&file), Need::All, true).is_err(), "not even in part");
     }
 
     let mut all = tensors();
@@ -219,7 +219,7 @@ fn weights_that_do_not_fit_are_listed() {
     copy.2[1] += 1.0;
     all.push(copy);
     write_pth(&file, &all);
-    let error = refusal(&[file.clone()]);
+    let error = refusal(std::slice::from_ref(&file));
     assert!(
         error.contains("depth.convs.f4.conv_se.bias and depth.decoder.0.conv_se.bias") && error.contains("element 1"),
         "{error}"
@@ -242,7 +242,7 @@ fn weights_that_do_not_fit_are_listed() {
         }
     }
     write_pth(&file, &all);
-    let error = refusal(&[file.clone()]);
+    let error = refusal(std::slice::from_ref(&file));
     assert!(
         error.contains("nearest is pico") && error.contains("channels 8 16 20 32 instead of 8 16 24 32"),
         "{error}"
@@ -250,7 +250,7 @@ fn weights_that_do_not_fit_are_listed() {
 
     let entries = [("height".to_owned(), Saved::Int(100)), ("stem.x".to_owned(), Saved::I64(1))];
     std::fs::write(&file, pth::to_bytes("x", &entries).expect("entries")).expect("written");
-    let error = refusal(&[file.clone()]);
+    let error = refusal(std::slice::from_ref(&file));
     assert!(error.contains("height: 100 is not a multiple of 32"), "{error}");
 }
 
@@ -480,7 +480,7 @@ fn networks_trained_on_imagenet_are_starts() {
         Start::of(&config).err().expect("refused").to_string()
     };
     let error = nano(Some(&mpvit), None);
-    assert!(error.contains("mpvit.pth") && error.contains("does not fit the preset nano: there are channels 8 16 24 32 instead of 32 48 64 96; these weights are of the preset pico"), "{error}");
+    assert!(error.contains("mpvit.pth") && error.contains("does not fit the preset nano: these weights have channels 8 16 24 32 instead of 32 48 64 96; they are of the preset pico"), "{error}");
     let error = nano(None, Some(&resnet));
     assert!(error.contains("resnet18.pth") && error.contains("pose width 4 instead of 16"), "{error}");
     let error = nano(Some(&resnet), None);

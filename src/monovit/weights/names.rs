@@ -151,7 +151,7 @@ mod tests {
             "encoder.convs.f4.x",
             "decoder.37.conv.bias",
             "decoder.x.bias",
-            "encoder.encoder.conv1.weight",
+            "encoder.encoder.stem.0.conv.weight",
             "transformer.fc.weight",
             "depth.fc.weight",
         ];

@@ -80,27 +80,30 @@ pub fn outputs(weights: &Weights, path: &Path, form: Form) -> Vec<PathBuf> {
 /// If a file cannot be written.
 pub fn save(weights: &Weights, path: &Path, form: Form) -> Result<()> {
     let entries = loaded(weights);
+    // The encoder is what a configuration belongs to: the other networks alone could be of several sizes.
+    let with_encoder = weights.report.matched.iter().any(|name| name.starts_with("encoder."));
     let (height, width) = (weights.config.height as i64, weights.config.width as i64);
-    let about = [("height", Saved::Int(height)), ("width", Saved::Int(width)), ("use_stereo", Saved::Bool(false))];
-    let about = about.map(|(name, value)| (name.to_owned(), value));
+    let size = if with_encoder { vec![("height", height), ("width", width)] } else { Vec::new() };
+    let about = || {
+        let size = size.iter().map(|&(name, pixels)| (name.to_owned(), Saved::Int(pixels)));
+        size.chain(with_encoder.then(|| ("use_stereo".to_owned(), Saved::Bool(false))))
+    };
     match form {
         Form::Safetensors => {
             let tensors = entries.iter().map(|e| (e.names[0].clone(), e.tensor.clone())).collect();
-            // The size is only known for certain with the encoder.
-            let certain = weights.report.matched.iter().any(|name| name.starts_with("encoder."));
-            let metadata = if certain { weights.config.metadata()? } else { HashMap::new() };
+            let metadata = if with_encoder { weights.config.metadata()? } else { HashMap::new() };
             checkpoint::write(path, &tensors, metadata)
         }
         Form::Npz => {
             let arrays: Vec<_> = entries.iter().map(|e| (&*e.names[0], e.tensor.dims(), e.tensor.data())).collect();
-            npz::write(path, &arrays, &[("height", height), ("width", width)])
+            npz::write(path, &arrays, &size)
         }
         Form::Pth => {
             let mut all = Vec::new();
             for entry in &entries {
                 push(&mut all, entry, |name| Some(name.to_owned()));
             }
-            all.extend(about);
+            all.extend(about());
             write_pth(path, &all)
         }
         Form::Folder => {
@@ -114,7 +117,7 @@ pub fn save(weights: &Weights, path: &Path, form: Form) -> Result<()> {
                     continue;
                 }
                 match *network {
-                    "encoder" => all.extend(about.clone()),
+                    "encoder" => all.extend(about()),
                     "depth" => {
                         let numbered: Vec<(String, Saved<'_>)> =
                             all.iter().filter_map(|(name, value)| Some((numbered(name)?, value.clone()))).collect();

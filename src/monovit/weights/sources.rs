@@ -128,7 +128,7 @@ impl Sources {
             [] => {
                 let (nearest, differences) = sizes.nearest();
                 let message = format!(
-                    "of no known size: the nearest is {}, but there are {}",
+                    "of no known size: the nearest is {}, but these weights have {}",
                     nearest.name(),
                     differences.join(", ")
                 );
@@ -164,11 +164,11 @@ impl Sources {
             return Ok(());
         }
         let advice = match sizes.fitting()[..] {
-            [one] => format!("; these weights are of the preset {}", one.name()),
+            [one] => format!("; they are of the preset {}", one.name()),
             _ => String::new(),
         };
         let message =
-            format!("does not fit the preset {}: there are {}{advice}", preset.name(), differences.join(", "));
+            format!("does not fit the preset {}: these weights have {}{advice}", preset.name(), differences.join(", "));
         Err(self.error(message))
     }
 
