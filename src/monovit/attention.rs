@@ -104,7 +104,10 @@ pub fn attention<T: Float>(model: &MonoVit, params: &Params<T>, image: &Tensor<T
 #[track_caller]
 pub fn effective_rows<T: Float>(qkv: &Tensor<T>, heads: usize, token: usize) -> Tensor<T> {
     let &[1, n, width] = qkv.dims() else { panic!("effective_rows: [1, N, 3 C] expected, found {}", qkv.shape()) };
-    assert!(heads > 0 && width % (3 * heads) == 0, "effective_rows: {width} channels are not q, k, v of {heads} heads");
+    assert!(
+        heads > 0 && width.is_multiple_of(3 * heads),
+        "effective_rows: {width} channels are not q, k, v of {heads} heads"
+    );
     assert!(token < n, "effective_rows: no token {token} among {n}");
     let (channels, c) = (width / 3, width / 3 / heads);
     let q = &qkv.data()[token * width..][..channels];

@@ -192,11 +192,11 @@ impl Config {
         if let Some((field, _)) = counts.into_iter().find(|&(_, least)| least == Some(0)) {
             return refuse(field, "0, but at least 1 is needed".into());
         }
-        if let Some(&channels) = self.channels.iter().find(|&&c| c == 0 || c % self.heads != 0) {
+        if let Some(&channels) = self.channels.iter().find(|&&c| c == 0 || !c.is_multiple_of(self.heads)) {
             return refuse("channels", format!("{channels} channels are not a multiple of {} heads", self.heads));
         }
         let first = self.channels[0];
-        if first % 4 != 0 {
+        if !first.is_multiple_of(4) {
             let message = format!("{first} channels of the first stage are not a multiple of 4, as the decoder needs");
             return refuse("channels", message);
         }
@@ -204,7 +204,7 @@ impl Config {
             return refuse("reduction", format!("{} leaves nothing of {channels} channels", self.reduction));
         }
         let shared: usize = self.windows.iter().map(|&(_, heads)| heads).sum();
-        if shared != self.heads || self.windows.iter().any(|&(window, heads)| window % 2 == 0 || heads == 0) {
+        if shared != self.heads || self.windows.iter().any(|&(window, heads)| window.is_multiple_of(2) || heads == 0) {
             let message = format!("odd windows whose heads sum to {} expected, found {:?}", self.heads, self.windows);
             return refuse("windows", message);
         }
