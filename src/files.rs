@@ -78,7 +78,7 @@ mod tests {
         check_writable(&folder).unwrap();
         assert_eq!(fs::read_dir(&folder).unwrap().count(), 0);
         fs::write(place.path().join("file"), "mine").unwrap();
-        let error = check_writable(&place.path().join("file/inside")).unwrap_err().to_string();
+        let error = check_writable(place.path().join("file/inside")).unwrap_err().to_string();
         assert!(error.contains("inside"), "{error}");
     }
 

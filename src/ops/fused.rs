@@ -36,7 +36,7 @@ impl Activation {
     }
 
     /// Whether the derivative follows from the result alone, so that the argument need not be kept.
-    pub(super) fn from_result(self) -> bool {
+    pub(super) fn follows_from_result(self) -> bool {
         self != Activation::Hardswish
     }
 

@@ -128,7 +128,7 @@ impl<T: Float> Op<T> for Conv2d {
         let (x, w, b) = (inputs[0], inputs[1], inputs.get(2).map(|b| b.data()));
         let g = Geometry::new(self, x.shape(), w.shape()).expect("checked by the shape rule");
         // What the backward pass cannot do without is kept in a pass of its own.
-        let keeps_argument = needs.any() && !self.activation.from_result();
+        let keeps_argument = needs.any() && !self.activation.follows_from_result();
         let finish = Finish::new(b, if keeps_argument { Activation::None } else { self.activation });
         let y = Tensor::build([g.batch, g.out[0], g.out[1], g.out_channels], |out| {
             if self.is_pointwise(g.kernel) {

@@ -79,7 +79,7 @@ impl<T: Float> Op<T> for DepthwiseConv2d {
         let [height, width] = window.output().expect("checked by the shape rule");
         let shape = x.shape().with(1, height).with(2, width);
         // What the backward pass cannot do without is kept in a pass of its own.
-        let keeps_argument = needs.any() && !self.activation.from_result();
+        let keeps_argument = needs.any() && !self.activation.follows_from_result();
         let finish = Finish::new(None, if keeps_argument { Activation::None } else { self.activation });
         let y = Tensor::build(shape, |out| {
             let x = Rows::dense(x.data(), x.shape().rows(), c);
