@@ -501,6 +501,10 @@ fn a_run_starts_from_any_of_them() {
     let start = Start::of(&RunConfig { allow_partial: true, ..config }).expect("started");
     assert!(!start.knows_motion);
     assert_weights(&start.params, &ALL[..2], "init in part");
+    // A pose encoder without its decoder knows nothing of motion.
+    let init = references(&["one_file/depth.pth", "pose_encoder.pth"]);
+    let config = RunConfig { init, allow_partial: true, ..RunConfig::new(Preset::Pico, 10) };
+    assert!(!Start::of(&config).expect("started").knows_motion);
 
     // Configurations as they were written before there could be several.
     let written = serde_json::to_value(RunConfig::new(Preset::Pico, 10)).expect("JSON");
