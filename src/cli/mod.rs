@@ -32,7 +32,7 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     /// Train; with no flags: the reduced network on the embedded street.
-    Train(train::Args),
+    Train(Box<train::Args>),
     /// Measure weights against ground-truth depth: the seven metrics.
     Eval(eval::Args),
     /// Turn pictures into depth maps.
@@ -53,7 +53,7 @@ enum Command {
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
     let result = start_threads(cli.threads).and_then(|()| match cli.command {
-        Command::Train(args) => train::run(args),
+        Command::Train(args) => train::run(*args),
         Command::Eval(args) => eval::run(args),
         Command::Predict(args) => predict::run(args),
         Command::Attention(args) => attention::run(args),
