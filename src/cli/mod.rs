@@ -34,7 +34,7 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     /// Train; with no flags: the reduced network on the embedded street.
-    Train(train::Args),
+    Train(Box<train::Args>),
     /// Measure weights against ground-truth depth: the seven metrics.
     Eval(eval::Args),
     /// Turn pictures into depth maps.
@@ -58,7 +58,7 @@ pub fn main() -> ExitCode {
     let cli = Cli::parse();
     let ready = parallax::tensor::simd::level().and_then(|_| start_threads(cli.threads));
     let result = ready.and_then(|()| match cli.command {
-        Command::Train(args) => train::run(args),
+        Command::Train(args) => train::run(*args),
         Command::Eval(args) => eval::run(args),
         Command::Predict(args) => predict::run(args),
         Command::Convert(args) => convert::run(args),
