@@ -9,6 +9,7 @@ use parallax::tensor::{Shape, Tape, Tensor, Var};
 
 /// Uniform numbers in [-1, 1].
 pub fn random(shape: impl Into<Shape>) -> Tensor<f32> {
+    start_threads();
     let mut random = Random::new(1, 2);
     Tensor::build(shape, |out| out.iter_mut().for_each(|x| *x = random.uniform(-1.0, 1.0) as f32))
 }
@@ -28,7 +29,6 @@ pub fn compare(
     ours: impl Fn(&[Var<f32>]) -> Var<f32>,
     others: &[Form],
 ) {
-    start_threads();
     let constants: Vec<_> = inputs.iter().cloned().map(Var::constant).collect();
     let expected = ours(&constants).into_value();
     let mut group = c.benchmark_group(name);
@@ -57,7 +57,8 @@ fn agree(what: &str, found: &[f32], expected: &[f32]) {
     }
 }
 
-/// Kernels run in a pool of which this thread is a part, as they do in the program.
+/// Kernels run in a pool of which this thread is a part, as they do in the program: before the first op, which would start
+/// another.
 fn start_threads() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {
