@@ -2,9 +2,9 @@
 
 use std::path::PathBuf;
 
-use super::MonoVit;
 use super::run::RunConfig;
 use super::weights::{Need, Sources, start_encoder, start_pose_encoder};
+use super::{Ablation, MonoVit};
 use crate::error::Result;
 use crate::nn::{Params, Report};
 
@@ -35,7 +35,7 @@ impl Start {
         let mut knows_motion = false;
         if !config.init.is_empty() {
             let sources = Sources::open(&config.init)?;
-            if !partial {
+            if !partial && config.ablation == Ablation::default() {
                 sources.expect(preset)?;
             }
             let report = sources.fill(&mut params, Need::All, partial)?;

@@ -29,7 +29,7 @@ pub use sources::{Need, Sources};
 use std::path::PathBuf;
 
 use super::run::RunConfig;
-use super::{MonoVit, Preset};
+use super::{Ablation, MonoVit, Preset};
 use crate::error::Result;
 use crate::nn::{Params, Report};
 
@@ -53,7 +53,8 @@ pub struct Weights {
 pub fn load(paths: &[PathBuf], need: Need, allow_partial: bool) -> Result<Weights> {
     let sources = Sources::open(paths)?;
     let config = sources.config(need)?;
-    if !allow_partial {
+    // Of a network that is not wholly a preset, tensor by tensor will do.
+    if !allow_partial && config.ablation == Ablation::default() {
         sources.expect(config.preset)?;
     }
     let (model, mut params) = MonoVit::new(config.model(), 0);
