@@ -97,6 +97,12 @@ fn check(preset: Preset) {
         let e = error(disparity, &expected);
         assert!(e <= 1e-9, "{size}: disparity {s}, normalisations folded: error {e:.1e}");
     }
+    let single = Folded::new(&params.cast::<f32>());
+    for (s, disparity) in model.predict(&single, &input("input").value().cast()).iter().enumerate() {
+        let expected = reference[&format!("{size}/disp/{s}")].permute(&[0, 2, 3, 1]);
+        let e = error(&disparity.cast(), &expected);
+        assert!(e <= 1e-4, "{size}: disparity {s} in f32: error {e:.1e}");
+    }
     let c = Context::folded(&folded);
     let motion = model.motion(&c, &input("input"), &input("input2"));
     let e = error(motion.value(), &reference[&format!("{size}/pose")]);
