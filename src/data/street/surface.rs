@@ -229,7 +229,7 @@ fn masonry(patch: &Patch, colour: Colour, seed: u32) -> Colour {
     let joint = pulse(patch.v, course, 0.014, patch.dv).max(0.7 * pulse(patch.u + shift, length, 0.014, patch.du));
     let each = hash_unit(floor((patch.u + shift) / length), row, seed) - 0.5;
     let tone = 1.0
-        + patch.octaves(&[(0.25, 0.45), (0.7, 0.5), (1.9, 0.42), (5.0, 0.3)], seed + 1)
+        + patch.octaves(&[(0.25, 0.3), (0.7, 0.34), (1.9, 0.3), (5.0, 0.22)], seed + 1)
         + 0.35 * each * fade((patch.du / length).max(patch.dv / course));
     scale(mix(colour, [0.66, 0.63, 0.58], 0.55 * joint), tone)
 }
@@ -247,7 +247,7 @@ impl Facade {
             masonry(&patch, self.wall, seed)
         } else {
             // Plaster: stains, and streaks of rain that run down.
-            let stains = patch.octaves(&[(0.22, 0.50), (0.6, 0.50), (1.6, 0.42), (4.5, 0.32)], seed);
+            let stains = patch.octaves(&[(0.22, 0.30), (0.6, 0.30), (1.6, 0.26), (4.5, 0.22)], seed);
             scale(self.wall, 1.0 + stains + 0.22 * patch.grain(2.3, 0.25, seed + 5))
         };
         // Upper storeys: a lattice of windows with frames, sills and lintels.
@@ -304,7 +304,7 @@ impl Facade {
             let blind = band(above, high * (0.3 + closed), high, patch.dv.max(0.02));
             glass = mix(glass, [0.78, 0.75, 0.69], 0.8 * own * blind);
         }
-        scale(glass, 1.0 + patch.octaves(&[(0.5, 0.5), (1.1, 0.5), (3.0, 0.4)], seed + 52))
+        scale(glass, 1.0 + patch.octaves(&[(1.1, 0.35), (3.0, 0.3)], seed + 52))
     }
 
     /// The ground floor: shop windows under a sign, or doors and windows.
@@ -354,7 +354,7 @@ impl Car {
         let [x, _, z] = p.local;
         let [fx, fy, fz] = p.footprint;
         // What the paint mirrors, held to the surface, and the dirt.
-        let sheen = patch.octaves(&[(0.6, 0.70), (1.6, 0.55), (4.0, 0.40), (9.0, 0.25)], seed);
+        let sheen = patch.octaves(&[(0.6, 0.42), (1.6, 0.34), (4.0, 0.26), (9.0, 0.14)], seed);
         let mut colour = scale(self.paint, 0.95 + 0.25 * (h - 0.6) + sheen);
         let dark = [0.07, 0.07, 0.075];
         if p.axis == 0 {
@@ -399,11 +399,10 @@ impl Car {
         let patch = p.patch();
         let [x, y, z] = p.local;
         let [fx, fy, fz] = p.footprint;
-        let sheen = patch.octaves(&[(0.8, 0.60), (2.0, 0.50), (5.0, 0.40)], seed + 3);
+        let sheen = patch.octaves(&[(0.8, 0.42), (2.0, 0.34), (5.0, 0.26)], seed + 3);
         let paint = scale(self.paint, 1.0 + sheen);
         // `y` is below the roof.
-        // What the panes mirror is most of what they show.
-        let glass = scale([0.30, 0.34, 0.38], (1.5 - 1.1 * y) * (1.0 + 1.3 * sheen));
+        let glass = scale([0.16, 0.19, 0.22], (1.5 - 1.1 * y) * (1.0 + 1.8 * sheen));
         if p.axis == 1 {
             let rails = band(x.abs(), 0.5, 0.54, fx);
             return scale(paint, 1.1 - 0.5 * rails);
