@@ -107,9 +107,10 @@ impl<T: Float> Op<T> for ConvTranspose2d {
     }
 
     fn algo(&self, inputs: &[Shape]) -> &'static str {
-        match self.geometry(&inputs[0], &inputs[1]) {
-            Ok(g) if g.transposed().is_some() => "im2col",
-            _ => "col2im",
+        match self.geometry(&inputs[0], &inputs[1]).ok().and_then(|g| g.transposed()) {
+            Some(g) if g.is_direct() => "direct",
+            Some(_) => "im2col",
+            None => "col2im",
         }
     }
 

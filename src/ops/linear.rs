@@ -1,8 +1,9 @@
-//! The linear layer: one GEMM over all the rows of the batch.
+//! The linear layer: one product over all the rows of the batch.
 
 use super::fused::{Activation, Finish};
 use super::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
-use crate::tensor::gemm::{Rows, RowsMut, gemm};
+use crate::tensor::gemm::Rows;
+use crate::tensor::register_tile::{Gram, Panels, Product};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
 /// `y [.., out] = x [.., in] w [in, out] (+ b [out])`. A 1x1 convolution is the same thing.
@@ -12,9 +13,9 @@ pub struct Linear {
     pub tile: usize,
 }
 
-/// Rows a tile: about 2^17 multiplications, at least 32 rows; or `tile`, if that is given.
+/// Rows a tile: about 2^17 multiplications, at least 40 rows; or `tile`, if that is given.
 fn tile_rows(tile: usize, k: usize, n: usize) -> usize {
-    if tile > 0 { tile } else { ((1 << 17) / (k * n).max(1)).clamp(32, 1024) }
+    if tile > 0 { tile } else { ((1 << 17) / (k * n).max(1)).clamp(40, 1000).next_multiple_of(20) }
 }
 
 /// `out = x w`, finished.
@@ -23,9 +24,10 @@ pub(super) fn forward<T: Float>(out: &mut [T], x: Rows<T>, w: &[T], finish: &Fin
     let n = out.len() / x.rows.max(1);
     let tile = tile_rows(tile, k, n);
     let work = 2 * out.len() * k;
+    let panels = Panels::dense(w, k, n);
     parallel::for_each_chunk(out, tile * n, work, |i, out| {
         let rows = out.len() / n;
-        gemm(RowsMut::dense(out, rows, n), Accum::Replace, x.rows(i * tile, rows), Rows::dense(w, k, n), T::ONE);
+        product(out, Accum::Replace, x.rows(i * tile, rows), &panels);
         finish.run(out);
     });
 }
@@ -36,10 +38,16 @@ pub(crate) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, dy: Rows<T>,
     let k = out.len() / dy.rows.max(1);
     let tile = tile_rows(tile, k, n);
     let work = 2 * out.len() * n;
+    let panels = Panels::transposed(w, n, k);
     parallel::for_each_chunk(out, tile * k, work, |i, out| {
         let rows = out.len() / k;
-        gemm(RowsMut::dense(out, rows, k), accum, dy.rows(i * tile, rows), Rows::dense(w, k, n).t(), T::ONE);
+        product(out, accum, dy.rows(i * tile, rows), &panels);
     });
+}
+
+/// `out = x panels`, or added to what is there.
+fn product<T: Float>(out: &mut [T], accum: Accum, x: Rows<T>, panels: &Panels<T>) {
+    Product { out, accum, lines: &[x.data], step: x.row_stride, run: x.cols, panels }.run();
 }
 
 /// How many partial sums a weight gradient is made of: depends on the shape alone.
@@ -105,7 +113,11 @@ pub(crate) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, x: Rows<T>,
     let product = |part: usize, out: &mut [T], accum| {
         let (from, to) = ((part * step).min(rows), ((part + 1) * step).min(rows));
         let (x, g) = (x.rows(from, to - from), g.rows(from, to - from));
-        gemm(RowsMut::dense(out, k, n), accum, x.t(), g, T::ONE);
+        if accum == Accum::Replace {
+            out.fill(T::ZERO);
+        }
+        let (terms, count) = (&[(x.data, g.data)], to - from);
+        Gram { out, out_step: n, rows: k, cols: n, terms, count, a_step: x.row_stride, b_step: g.row_stride }.run();
     };
     if parts == 1 {
         return product(0, out, accum);
@@ -164,6 +176,7 @@ impl Checked for Linear {
             Case::new("tile and one", tiled(4), [x(&[5, 5]), w(5, 2), b(2)]),
             Case::new("partial sums", tiled(0), [x(&[300, 2]), w(2, 3), b(3)]),
             Case::new("partial sums without bias", tiled(0), [x(&[300, 2]), w(2, 3)]),
+            Case::new("several register tiles", tiled(0), [x(&[25, 11]), w(11, 17), b(17)]),
             Case::new("no rows", tiled(0), [x(&[0, 2]), w(2, 3), b(3)]).flat(),
         ]
     }

@@ -10,6 +10,7 @@
 //! | [`var`] | [`Var`]: a tensor that a tape may track |
 //! | [`gradients`] | where gradients are accumulated and read |
 //! | [`gemm`] | matrix products (faer) |
+//! | `register_tile` | products whose operands stay where they lie: convolutions, linear layers |
 //! | [`parallel`] | threads, with the same bits for any number of them |
 //! | [`simd`] | run-time choice of instruction set |
 //! | [`trace`] | what ran, and how long |
@@ -21,6 +22,7 @@ pub mod gemm_small;
 pub mod gradients;
 pub mod parallel;
 pub mod pool;
+pub(crate) mod register_tile;
 pub mod shape;
 pub mod simd;
 pub mod tape;

@@ -176,6 +176,19 @@ vector!(
     as_mut_simd_f64s
 );
 
+/// Elements in a vector of the best instruction set of this machine.
+pub(crate) fn lanes<T: Vector>() -> usize {
+    struct Lanes<T>(std::marker::PhantomData<T>);
+    impl<T: Vector> WithSimd for Lanes<T> {
+        type Output = usize;
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, _: S) -> usize {
+            T::lanes::<S>()
+        }
+    }
+    dispatch_vector(Lanes::<T>(std::marker::PhantomData))
+}
+
 /// Runs a kernel that is written in [`Vector`]s with those of the best instruction set of this machine.
 #[inline(always)]
 pub fn dispatch_vector<K: WithSimd>(kernel: K) -> K::Output {

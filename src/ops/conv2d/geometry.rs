@@ -65,7 +65,13 @@ impl Geometry {
     /// The input row or column under window position `k` of output row or column `o`; `None` in zero padding.
     #[inline(always)]
     pub(super) fn source(&self, d: usize, o: usize, k: usize) -> Option<usize> {
-        let i = (o * self.stride[d] + k * self.dilation[d]) as isize - self.padding[d] as isize;
+        self.padded(d, o * self.stride[d] + k * self.dilation[d])
+    }
+
+    /// The input row or column at a position of the padded image; `None` in zero padding.
+    #[inline(always)]
+    pub(super) fn padded(&self, d: usize, at: usize) -> Option<usize> {
+        let i = at as isize - self.padding[d] as isize;
         let n = self.size[d] as isize;
         if (0..n).contains(&i) {
             Some(i as usize)
@@ -104,13 +110,23 @@ impl Geometry {
         self.batch * self.out[0]
     }
 
-    /// Output rows a tile: an im2col matrix of some 256 KiB, and at least four tiles where there are four rows.
+    /// Whether the windows of neighbouring pixels are runs of one padded row, a step apart.
+    pub(in crate::ops) fn is_direct(&self) -> bool {
+        self.groups == 1 && self.dilation[1] == 1
+    }
+
+    /// Output rows a tile, at least four tiles where there are four rows: an im2col matrix of some 256 KiB; or half of
+    /// that in rows of the image, or of the output.
     pub(super) fn tile(&self) -> usize {
-        const ELEMENTS: usize = 1 << 16;
         if self.tile > 0 {
             return self.tile;
         }
-        let fitting = ELEMENTS / (self.patch() * self.out[1]).max(1);
+        let fitting = if self.is_direct() {
+            let pixel = (self.channels * self.stride[0] * self.stride[1]).max(self.out_channels);
+            (1 << 15) / (pixel * self.out[1]).max(1)
+        } else {
+            (1 << 16) / (self.patch() * self.out[1]).max(1)
+        };
         fitting.clamp(1, self.rows().div_ceil(4).max(1))
     }
 
@@ -119,10 +135,9 @@ impl Geometry {
     ///
     /// A product fills vector registers along the output's channels. Where these are few, `s` pixels side by side fill
     /// them better: they share a window that is `s - 1` strides wider, whose weights are zero where a pixel does not
-    /// look. That is more arithmetic, but at the full width of the registers, and less of the im2col matrix, since
-    /// neighbouring windows overlap.
+    /// look. That is more arithmetic, but at the full width of the registers.
     pub(in crate::ops) fn side_by_side(&self) -> usize {
-        if self.groups > 1 || self.dilation[1] != 1 || self.kernel[1] == 1 {
+        if !self.is_direct() || self.kernel[1] == 1 {
             return 1;
         }
         let fits = [1, 2, 4, 8, 16].into_iter().filter(|s| self.out[1].is_multiple_of(*s) && self.out[1] > 0);
@@ -130,16 +145,11 @@ impl Geometry {
         costs.min_by(|a, b| a.0.total_cmp(&b.0)).map_or(1, |(_, s)| s)
     }
 
-    /// What an output pixel costs, for each row and channel of the window, with `s` side by side: the product, and the
-    /// copies of im2col.
+    /// Registers of 16 numbers multiplied for an output pixel, for each row and channel of the window, with `s` side by
+    /// side.
     fn cost(&self, s: usize) -> f64 {
-        let window = (self.kernel[1] + (s - 1) * self.stride[1]) as f64;
-        let lanes = s * self.out_channels;
-        // Registers of 16 numbers; with one alone, additions wait for each other half of the time.
-        let registers = lanes.div_ceil(16);
-        let waiting = if registers == 1 { 2.0 } else { 1.0 };
-        // 32 multiply-adds, or 6 copied numbers, in a clock cycle.
-        window * (waiting * (registers * 16) as f64 / s as f64 / 32.0 + 1.0 / s as f64 / 6.0)
+        let window = self.kernel[1] + (s - 1) * self.stride[1];
+        (window * (s * self.out_channels).div_ceil(16)) as f64 / s as f64
     }
 
     /// The same convolution with `s` outputs of a row as one pixel.

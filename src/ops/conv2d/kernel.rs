@@ -1,5 +1,6 @@
 //! The three products of a convolution, tile by tile: outputs, the gradient of the input, the gradient of the weights.
 
+use super::direct;
 use super::geometry::Geometry;
 use crate::ops::fused::Finish;
 use crate::ops::linear::sum_into;
@@ -60,12 +61,11 @@ pub(in crate::ops) fn convolve<T: Float>(
     w: &[T],
     finish: &Finish<T>,
 ) {
-    let side_by_side = g.side_by_side();
-    if side_by_side > 1 {
-        let wide = g.widened(side_by_side);
-        return product(out, accum, &wide, x, &widened(g, side_by_side, w), finish);
+    match g.side_by_side() {
+        _ if !g.is_direct() => product(out, accum, g, x, w, finish),
+        1 => direct::convolve(out, accum, g, x, w, finish),
+        s => direct::convolve(out, accum, &g.widened(s), x, &widened(g, s, w), finish),
     }
-    product(out, accum, g, x, w, finish);
 }
 
 /// The weights of `s` outputs side by side, `[kh, kw + (s - 1) stride, in, s out]`: each output's own, as many strides
@@ -235,39 +235,23 @@ fn scatter<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, dy: &[T], w: &[T
 
 /// dw: the sum over pixels of patch^T dy, in a fixed number of partial sums.
 pub(in crate::ops) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: &[T], dy: &[T]) {
-    let (n, ng, patch, width, tile) = (g.out_channels, g.group_out(), g.patch(), g.out[1], g.tile());
+    let (n, patch, tile) = (g.out_channels, g.patch(), g.tile());
     let tiles = g.rows().div_ceil(tile);
     let parts = tiles.clamp(1, PARTS);
-    // A product fills registers along the rows of its result: those had better be long.
-    let transposed = g.groups == 1 && n < 64 && n < patch;
-    let partial = |part: usize, sum: &mut [T], mut accum: Accum| {
-        let mine = part * tiles / parts..(part + 1) * tiles / parts;
-        if mine.is_empty() && accum == Accum::Replace {
-            sum.fill(T::ZERO);
-        }
-        let mut patches = Buffer::stale(tile.min(g.rows()) * width * patch);
-        for first in mine.map(|t| t * tile) {
+    let transposed = g.is_direct() && direct::is_better_transposed(g);
+    let partial = |part: usize, sum: &mut [T]| {
+        sum.fill(T::ZERO);
+        for first in (part * tiles / parts..(part + 1) * tiles / parts).map(|t| t * tile) {
             let rows = tile.min(g.rows() - first);
-            let pixels = rows * width;
-            for group in 0..g.groups {
-                let patches = &mut patches[..pixels * patch];
-                im2col_tile(g, x, first, rows, group, patches);
-                let dy = Rows::columns(&dy[first * width * n..][..pixels * n], pixels, n, group * ng, ng);
-                let patches = Rows::dense(patches, pixels, patch);
-                if transposed {
-                    gemm(RowsMut::dense(sum, n, patch), accum, dy.t(), patches, T::ONE);
-                } else {
-                    gemm(RowsMut::columns(sum, patch, n, group * ng, ng), accum, patches.t(), dy, T::ONE);
-                }
+            if g.is_direct() {
+                direct::add_weight_gradient(sum, g, x, dy, first..first + rows, transposed);
+            } else {
+                add_weight_gradient(sum, g, x, dy, first, rows);
             }
-            accum = Accum::Add;
         }
     };
-    if parts == 1 && !transposed {
-        return partial(0, out, accum);
-    }
-    let work = 2 * g.rows() * width * patch * n;
-    let sums = parallel::map(parts, work, |part| Tensor::build([patch * n], |sum| partial(part, sum, Accum::Replace)));
+    let work = 2 * g.rows() * g.out[1] * patch * n;
+    let sums = parallel::map(parts, work, |part| Tensor::build([patch * n], |sum| partial(part, sum)));
     if transposed {
         let mut sum = Buffer::stale(patch * n);
         sum_into(&mut sum, Accum::Replace, &sums);
@@ -279,6 +263,19 @@ pub(in crate::ops) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, g: 
         return;
     }
     sum_into(out, accum, &sums);
+}
+
+/// What some output rows add to dw: products of their im2col matrix.
+fn add_weight_gradient<T: Float>(sum: &mut [T], g: &Geometry, x: &[T], dy: &[T], first: usize, rows: usize) {
+    let (n, ng, patch, width) = (g.out_channels, g.group_out(), g.patch(), g.out[1]);
+    let pixels = rows * width;
+    let mut patches = Buffer::stale(pixels * patch);
+    for group in 0..g.groups {
+        im2col_tile(g, x, first, rows, group, &mut patches);
+        let dy = Rows::columns(&dy[first * width * n..][..pixels * n], pixels, n, group * ng, ng);
+        let patches = Rows::dense(&patches, pixels, patch);
+        gemm(RowsMut::columns(sum, patch, n, group * ng, ng), Accum::Add, patches.t(), dy, T::ONE);
+    }
 }
 
 /// Partial sums of a weight gradient.

@@ -1,9 +1,11 @@
-//! 2-D convolution: im2col in tiles that fit the cache, times the weights; a 1x1 convolution is the GEMM alone.
+//! 2-D convolution: windows times weights. A 1x1 convolution is a product of the pixels as they lie.
 //!
-//! In this layout the patch of one output pixel is `kernel height` contiguous runs of `kernel width * channels` numbers,
-//! so a tile of the im2col matrix is filled by copies of whole runs. Reflection padding is a matter of which run is
-//! copied, and costs nothing.
+//! In this layout the window of one output pixel is `kernel height` contiguous runs of `kernel width * channels` numbers.
+//! `direct` multiplies these runs where they lie in a padded row; grouped convolutions, and those dilated along the row,
+//! whose windows are not whole runs, are copied into an im2col matrix in tiles that fit the cache (`kernel`). Reflection
+//! padding is a matter of what is copied, and costs nothing.
 
+mod direct;
 pub(super) mod geometry;
 pub(super) mod kernel;
 
@@ -101,10 +103,10 @@ impl<T: Float> Op<T> for Conv2d {
         let Ok(g) = Geometry::new(self, &inputs[0], &inputs[1]) else { return "none" };
         let [plain, relu, hardswish, elu] = match g.side_by_side() {
             _ if self.is_pointwise(g.kernel) => paths!("pointwise"),
-            _ if self.groups > 1 => paths!("grouped"),
-            1 if self.reflect => paths!("im2col_reflect"),
-            1 if self.stride != [1; 2] => paths!("im2col_strided"),
-            1 => paths!("im2col"),
+            _ if !g.is_direct() => paths!("im2col"),
+            1 if self.reflect => paths!("direct_reflect"),
+            1 if self.stride != [1; 2] => paths!("direct_strided"),
+            1 => paths!("direct"),
             _ if self.reflect => paths!("side_by_side_reflect"),
             _ if self.stride != [1; 2] => paths!("side_by_side_strided"),
             _ => paths!("side_by_side"),
@@ -257,6 +259,8 @@ impl Checked for Conv2d {
             case("side by side, reflected", same.reflecting(), [2, 3, 8, 2], [3, 3, 2, 3], true),
             case("side by side, tile and one", Conv2d { tile: 4, ..same }, [1, 5, 4, 2], [3, 3, 2, 2], false),
             case("many channels", same, [1, 3, 5, 1], [3, 3, 1, 70], false),
+            case("several register tiles", same, [1, 2, 15, 4], [3, 3, 4, 17], true),
+            case("register tiles of few rows and many columns", same, [1, 2, 11, 4], [3, 3, 4, 16], false),
             case("empty batch", same, [0, 4, 5, 3], [3, 3, 3, 4], true).flat(),
         ];
         for activation in [Activation::Relu, Activation::Hardswish, Activation::Elu] {

@@ -1,0 +1,342 @@
+//! Matrix products whose operands stay where they lie: a tile of the result is held in registers while it is summed.
+//!
+//! A general product ([`gemm`](super::gemm)) copies both operands into an order of its own first. Convolutions need no
+//! such copy: the window of an output pixel is, for each of its rows, one run of numbers in the image, and the windows
+//! of its neighbours are the same run a step further on. A number of the left operand is spread over a vector and
+//! multiplied with a few vectors of the right one, for ten rows of the result at once, so that twenty sums wait for
+//! each other's additions. Every sum runs over its products in one order, whatever the tile and the instruction set.
+
+use pulp::{Simd, WithSimd};
+
+use super::gemm::Accum;
+use super::pool::Buffer;
+use super::simd::{copy_run, dispatch_vector};
+use super::{Float, simd};
+
+/// Vectors side by side in a tile of the result.
+const VECTORS: usize = 2;
+
+/// The right operand of a product, cut into panels of [`VECTORS`] vectors of columns, one panel after the other, the
+/// last one filled up with zeros.
+pub(crate) struct Panels<T: Float> {
+    data: Buffer<T>,
+    rows: usize,
+    cols: usize,
+    lanes: usize,
+}
+
+impl<T: Float> Panels<T> {
+    /// A dense matrix as it lies.
+    pub(crate) fn dense(matrix: &[T], rows: usize, cols: usize) -> Self {
+        Self::pack(rows, cols, |first, width, step, panel| {
+            for (out, row) in panel.chunks_exact_mut(step).zip(matrix.chunks_exact(cols)) {
+                copy_run(&mut out[..width], &row[first..first + width]);
+            }
+        })
+    }
+
+    /// The transpose of a dense `[cols, rows]` matrix.
+    pub(crate) fn transposed(matrix: &[T], rows: usize, cols: usize) -> Self {
+        Self::pack(rows, cols, |first, width, step, panel| {
+            for (j, column) in matrix.chunks_exact(rows).skip(first).take(width).enumerate() {
+                panel[j..].iter_mut().step_by(step).zip(column).for_each(|(p, &c)| *p = c);
+            }
+        })
+    }
+
+    /// `fill(first, width, step, panel)` writes `width` columns from `first` on into rows of `step` numbers.
+    #[inline(always)]
+    fn pack(rows: usize, cols: usize, fill: impl Fn(usize, usize, usize, &mut [T])) -> Self {
+        let lanes = simd::lanes::<T>();
+        let wide = VECTORS * lanes;
+        let mut data = Buffer::stale(rows * cols.next_multiple_of(lanes));
+        if rows > 0 {
+            simd::dispatch(
+                #[inline(always)]
+                || {
+                    for (k, panel) in data.chunks_mut(wide * rows).enumerate() {
+                        let (first, step) = (k * wide, panel.len() / rows);
+                        let width = step.min(cols - first);
+                        if width < step {
+                            panel.fill(T::ZERO);
+                        }
+                        fill(first, width, step, panel);
+                    }
+                },
+            );
+        }
+        Panels { data, rows, cols, lanes }
+    }
+}
+
+/// `out = A B`, or added to what is there: row p of A is the concatenation of `line[p * step..][..run]` over the lines.
+///
+/// `out` has rows of as many numbers as B has columns.
+pub(crate) struct Product<'a, T: Float> {
+    pub(crate) out: &'a mut [T],
+    pub(crate) accum: Accum,
+    pub(crate) lines: &'a [&'a [T]],
+    pub(crate) step: usize,
+    pub(crate) run: usize,
+    pub(crate) panels: &'a Panels<T>,
+}
+
+impl<T: Float> Product<'_, T> {
+    /// Computes it.
+    ///
+    /// # Panics
+    /// If a line is too short, or B has not as many rows as A has columns.
+    pub(crate) fn run(self) {
+        let Panels { rows, cols, .. } = *self.panels;
+        assert_eq!(rows, self.lines.len() * self.run, "rows of the right operand");
+        if cols == 0 || self.out.is_empty() {
+            return;
+        }
+        if rows == 0 {
+            if self.accum == Accum::Replace {
+                self.out.fill(T::ZERO);
+            }
+            return;
+        }
+        dispatch_vector(self);
+    }
+
+    #[inline(always)]
+    fn panel<S: Simd, const P: usize, const N: usize>(&mut self, simd: S, first: usize) {
+        let cols = self.panels.cols;
+        let rows = self.out.len() / cols;
+        let panel = &self.panels.data[first * self.panels.rows..][..self.panels.rows * N * T::lanes::<S>()];
+        let mut at = 0;
+        while at + P <= rows {
+            self.tile::<S, P, N>(simd, panel, at, first);
+            at += P;
+        }
+        while at + 4 <= rows {
+            self.tile::<S, 4, N>(simd, panel, at, first);
+            at += 4;
+        }
+        while at < rows {
+            self.tile::<S, 1, N>(simd, panel, at, first);
+            at += 1;
+        }
+    }
+
+    #[inline(always)]
+    fn tile<S: Simd, const P: usize, const N: usize>(&mut self, simd: S, panel: &[T], at: usize, first: usize) {
+        let (lanes, cols, run) = (T::lanes::<S>(), self.panels.cols, self.run);
+        let mut sums = [[T::splat(simd, T::ZERO); N]; P];
+        for (line, b) in self.lines.iter().zip(panel.chunks_exact(run * N * lanes)) {
+            let a: [&[T]; P] = std::array::from_fn(|p| &line[(at + p) * self.step..][..run]);
+            for (j, b) in b.chunks_exact(N * lanes).enumerate() {
+                let b: [_; N] = std::array::from_fn(|q| T::load(simd, &b[q * lanes..]));
+                for p in 0..P {
+                    let x = T::splat(simd, a[p][j]);
+                    for q in 0..N {
+                        sums[p][q] = T::fma(simd, x, b[q], sums[p][q]);
+                    }
+                }
+            }
+        }
+        let out = self.out[at * cols..(at + P) * cols].chunks_exact_mut(cols);
+        for (out, sums) in out.zip(sums) {
+            for (q, &sum) in sums.iter().enumerate() {
+                settle(simd, &mut out[first + q * lanes..], sum, self.accum);
+            }
+        }
+    }
+}
+
+/// Writes a vector, or adds it, as far as there is room.
+#[inline(always)]
+fn settle<T: Float, S: Simd>(simd: S, out: &mut [T], sum: T::V<S>, accum: Accum) {
+    let lanes = T::lanes::<S>();
+    if out.len() >= lanes {
+        let sum = if accum == Accum::Add { T::vector_add(simd, T::load(simd, out), sum) } else { sum };
+        T::store(simd, out, sum);
+    } else {
+        let sum = if accum == Accum::Add { T::vector_add(simd, T::load_part(simd, out), sum) } else { sum };
+        T::store_part(simd, out, sum);
+    }
+}
+
+impl<T: Float> WithSimd for Product<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(mut self, simd: S) {
+        let lanes = self.panels.lanes;
+        let end = self.panels.cols.next_multiple_of(lanes);
+        let mut first = 0;
+        // Of 16 registers, ten sums and two factors leave some to spare; of 32, twenty.
+        while first + VECTORS * lanes <= end {
+            match S::REGISTER_COUNT {
+                0..32 => self.panel::<S, 5, VECTORS>(simd, first),
+                _ => self.panel::<S, 10, VECTORS>(simd, first),
+            }
+            first += VECTORS * lanes;
+        }
+        if first < end {
+            self.panel::<S, 10, 1>(simd, first);
+        }
+    }
+}
+
+/// `out += A^T B`: each of the terms has `count` rows of A, `a[i * a_step..][..rows]`, and as many of B,
+/// `b[i * b_step..][..cols]`. `out` has `rows` rows of `out_step` numbers, of which the first `cols` are meant.
+pub(crate) struct Gram<'a, T: Float> {
+    pub(crate) out: &'a mut [T],
+    pub(crate) out_step: usize,
+    pub(crate) rows: usize,
+    pub(crate) cols: usize,
+    pub(crate) terms: &'a [(&'a [T], &'a [T])],
+    pub(crate) count: usize,
+    pub(crate) a_step: usize,
+    pub(crate) b_step: usize,
+}
+
+impl<T: Float> Gram<'_, T> {
+    /// Computes it.
+    ///
+    /// # Panics
+    /// If a slice is too short.
+    pub(crate) fn run(self) {
+        if self.rows * self.cols * self.count > 0 {
+            dispatch_vector(self);
+        }
+    }
+
+    #[inline(always)]
+    fn columns<S: Simd, const P: usize, const N: usize, const PART: bool>(&mut self, simd: S, first: usize) {
+        let mut at = 0;
+        while at + P <= self.rows {
+            self.tile::<S, P, N, PART>(simd, at, first);
+            at += P;
+        }
+        while at + 4 <= self.rows {
+            self.tile::<S, 4, N, PART>(simd, at, first);
+            at += 4;
+        }
+        while at < self.rows {
+            self.tile::<S, 1, N, PART>(simd, at, first);
+            at += 1;
+        }
+    }
+
+    /// `PART`: the last of the vectors is not full.
+    #[inline(always)]
+    fn tile<S: Simd, const P: usize, const N: usize, const PART: bool>(&mut self, simd: S, at: usize, first: usize) {
+        let lanes = T::lanes::<S>();
+        let width = if PART { self.cols - first } else { N * lanes };
+        let mut sums = [[T::splat(simd, T::ZERO); N]; P];
+        for (a, b) in self.terms {
+            for i in 0..self.count {
+                let a = &a[i * self.a_step + at..][..P];
+                let b = &b[i * self.b_step + first..][..width];
+                let b: [_; N] = std::array::from_fn(|q| {
+                    let b = &b[q * lanes..];
+                    if PART && q + 1 == N { T::load_part(simd, b) } else { T::load(simd, b) }
+                });
+                for p in 0..P {
+                    let x = T::splat(simd, a[p]);
+                    for q in 0..N {
+                        sums[p][q] = T::fma(simd, x, b[q], sums[p][q]);
+                    }
+                }
+            }
+        }
+        for (p, sums) in sums.iter().enumerate() {
+            let out = &mut self.out[(at + p) * self.out_step + first..][..width];
+            for (q, &sum) in sums.iter().enumerate() {
+                settle(simd, &mut out[q * lanes..], sum, Accum::Add);
+            }
+        }
+    }
+}
+
+impl<T: Float> WithSimd for Gram<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(mut self, simd: S) {
+        let lanes = T::lanes::<S>();
+        let mut first = 0;
+        while first < self.cols {
+            let left = self.cols - first;
+            // Channels come in multiples of eight more often than of ten.
+            if left >= VECTORS * lanes {
+                match S::REGISTER_COUNT {
+                    0..32 => self.columns::<S, 4, VECTORS, false>(simd, first),
+                    _ => self.columns::<S, 8, VECTORS, false>(simd, first),
+                }
+            } else if left == lanes {
+                self.columns::<S, 8, 1, false>(simd, first);
+            } else if left > lanes {
+                self.columns::<S, 4, VECTORS, true>(simd, first);
+            } else {
+                self.columns::<S, 8, 1, true>(simd, first);
+            }
+            first += VECTORS * lanes;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn numbers(n: usize) -> Vec<f64> {
+        (0..n as u64).map(|i| (i.wrapping_mul(2654435761) % 1000) as f64 / 500.0 - 1.0).collect()
+    }
+
+    #[test]
+    fn a_product_is_the_sum_it_stands_for() {
+        for (rows, cols, step, run, lines) in
+            [(1, 1, 1, 1, 1), (23, 5, 2, 6, 3), (14, 16, 4, 4, 1), (11, 33, 3, 9, 2), (9, 50, 1, 7, 3)]
+        {
+            let data = numbers(lines * ((rows - 1) * step + run));
+            let lines: Vec<&[f64]> = data.chunks((rows - 1) * step + run).collect();
+            let b = numbers(lines.len() * run * cols);
+            let panels = Panels::dense(&b, lines.len() * run, cols);
+            let expected = |p: usize, n: usize| -> f64 {
+                let terms = lines
+                    .iter()
+                    .enumerate()
+                    .flat_map(|(l, line)| (0..run).map(move |j| (line[p * step + j], l * run + j)));
+                terms.map(|(a, k)| a * b[k * cols + n]).sum()
+            };
+            for (accum, start) in [(Accum::Replace, 0.0), (Accum::Add, 0.5)] {
+                let mut out = vec![if accum == Accum::Add { start } else { f64::NAN }; rows * cols];
+                Product { out: &mut out, accum, lines: &lines, step, run, panels: &panels }.run();
+                for (i, &found) in out.iter().enumerate() {
+                    let expected = start + expected(i / cols, i % cols);
+                    assert!((found - expected).abs() < 1e-12, "{rows}x{cols}, {i}: {found} for {expected}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn panels_of_a_transpose_are_those_of_the_matrix() {
+        let b = numbers(7 * 21);
+        let turned: Vec<f64> = (0..7 * 21).map(|i| b[(i % 7) * 21 + i / 7]).collect();
+        assert_eq!(*Panels::dense(&b, 7, 21).data, *Panels::transposed(&turned, 7, 21).data);
+    }
+
+    #[test]
+    fn a_gram_product_is_the_sum_it_stands_for() {
+        for (rows, cols, count) in [(1, 1, 2), (13, 8, 6), (10, 16, 4), (7, 21, 10), (5, 37, 4)] {
+            let (a_step, b_step, out_step) = (rows + 2, cols + 1, cols + 3);
+            let (a, b) = (numbers(count * a_step), numbers(count * b_step));
+            let mut out = vec![0.25; rows * out_step];
+            let half = count / 2;
+            let terms = [(&a[..], &b[..]), (&a[half * a_step..], &b[half * b_step..])];
+            Gram { out: &mut out, out_step, rows, cols, terms: &terms, count: half, a_step, b_step }.run();
+            for (i, &found) in out.iter().enumerate() {
+                let (r, c) = (i / out_step, i % out_step);
+                let terms = (0..count).map(|t| a[t * a_step + r] * b[t * b_step + c.min(cols - 1)]);
+                let expected = 0.25 + if c < cols { terms.sum() } else { 0.0 };
+                assert!((found - expected).abs() < 1e-12, "{rows}x{cols}, {i}: {found} for {expected}");
+            }
+        }
+    }
+}
