@@ -158,8 +158,8 @@ impl AttentionConv {
         let Some(attention) = &self.attention else { return self.conv.forward(c, z) };
         let [b, _, _, channels] = z.shape().nhwc().expect("an image");
         let gate = attention.gate(c, z);
-        // Of one picture nobody trains on, the weights take the gate: there are fewer of them than pixels.
-        if b == 1 && !c.is_training() {
+        // Of one picture, the weights take the gate: there are fewer of them than pixels.
+        if b == 1 {
             return self.conv.forward_gated(c, z, &gate);
         }
         self.conv.forward(c, &(z * gate.reshape([b, 1, 1, channels])))

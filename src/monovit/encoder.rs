@@ -279,8 +279,8 @@ impl TransformerLayer {
         let attention = qkv.factorised_attention(self.heads) + qkv.conv_relative_position(h, w, self.heads, &windows);
         let x = x + c.drop_path(self.proj.forward(c, &attention), self.drop_path);
 
-        let hidden = self.fc1.forward(c, &self.norm2.forward(c, &x)).gelu();
-        let x = &x + c.drop_path(self.fc2.forward(c, &hidden), self.drop_path);
+        let hidden = self.fc1.forward(c, &self.norm2.forward(c, &x));
+        let x = &x + c.drop_path(self.fc2.forward_of_gelu(c, &hidden), self.drop_path);
         x.reshape([b, h, w, channels])
     }
 }

@@ -23,4 +23,10 @@ impl Linear {
     pub fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
         x.linear(c.var(self.weight), self.bias.map(|b| c.var(b)))
     }
+
+    /// The same of gelu(x), `[.., in] -> [.., out]`.
+    #[track_caller]
+    pub fn forward_of_gelu<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
+        x.gelu_linear(c.var(self.weight), self.bias.map(|b| c.var(b)))
+    }
 }

@@ -1,14 +1,19 @@
 //! The linear layer: one product over all the rows of the batch.
 
 use super::fused::{Activation, Finish};
+use super::unary::{Function, Gelu};
 use super::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::gemm::Rows;
+use crate::tensor::pool::Buffer;
 use crate::tensor::register_tile::{Gram, Panels, Product};
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
 /// `y [.., out] = x [.., in] w [in, out] (+ b [out])`. A 1x1 convolution is the same thing.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Linear {
+    /// Whether x passes through GELU on its way: `y = gelu(x) w + b`, as in the second half of a transformer's MLP.
+    /// gelu(x), the widest tensor of a block, is then computed tile by tile and again for the gradient, never kept.
+    pub gelu: bool,
     /// Rows handed to a thread at a time; chosen by shape if 0. A gradient check shrinks it to reach tile edges.
     pub tile: usize,
 }
@@ -29,6 +34,61 @@ pub(super) fn forward<T: Float>(out: &mut [T], x: Rows<T>, w: &[T], finish: &Fin
         let rows = out.len() / n;
         product(out, Accum::Replace, x.rows(i * tile, rows), &panels);
         finish.run(out);
+    });
+}
+
+/// `to = gelu(from)`.
+fn gelu<T: Float>(to: &mut [T], from: &[T]) {
+    simd::dispatch(
+        #[inline(always)]
+        || to.iter_mut().zip(from).for_each(|(t, &x)| *t = Gelu.f(x)),
+    );
+}
+
+/// The whole of gelu(x).
+fn apply_gelu<T: Float>(x: &Tensor<T>) -> Tensor<T> {
+    const CHUNK: usize = 1 << 14;
+    Tensor::build(*x.shape(), |out| {
+        let work = 16 * out.len();
+        parallel::for_each_chunk(out, CHUNK, work, |i, out| gelu(out, &x.data()[i * CHUNK..][..out.len()]));
+    })
+}
+
+/// `out = gelu(x) w`, finished; x has rows of k.
+fn forward_of_gelu<T: Float>(out: &mut [T], x: Rows<T>, w: &[T], finish: &Finish<T>, tile: usize) {
+    let k = x.cols;
+    let n = out.len() / x.rows.max(1);
+    let tile = tile_rows(tile, k, n);
+    let work = (2 * n + 16) * x.rows * k;
+    let panels = Panels::dense(w, k, n);
+    parallel::for_each_chunk(out, tile * n, work, |i, out| {
+        let rows = out.len() / n;
+        let mut h = Buffer::stale(rows * k);
+        gelu(&mut h, &x.data[i * tile * k..][..rows * k]);
+        product(out, Accum::Replace, Rows::dense(&h, rows, k), &panels);
+        finish.run(out);
+    });
+}
+
+/// `dx = dy w^T gelu'(x)`.
+fn input_gradient_of_gelu<T: Float>(out: &mut [T], accum: Accum, x: &[T], dy: Rows<T>, w: &[T], tile: usize) {
+    let n = dy.cols;
+    let k = out.len() / dy.rows.max(1);
+    let tile = tile_rows(tile, k, n);
+    let work = (2 * n + 32) * out.len();
+    let panels = Panels::transposed(w, n, k);
+    parallel::for_each_chunk(out, tile * k, work, |i, out| {
+        let rows = out.len() / k;
+        let mut dh = Buffer::stale(out.len());
+        product(&mut dh, Accum::Replace, dy.rows(i * tile, rows), &panels);
+        let terms = dh.iter().zip(&x[i * tile * k..]);
+        simd::dispatch(
+            #[inline(always)]
+            || match accum {
+                Accum::Replace => out.iter_mut().zip(terms).for_each(|(d, (&dh, &x))| *d = dh * Gelu.df(x)),
+                Accum::Add => out.iter_mut().zip(terms).for_each(|(d, (&dh, &x))| *d += dh * Gelu.df(x)),
+            },
+        );
     });
 }
 
@@ -71,7 +131,12 @@ impl<T: Float> Op<T> for Linear {
     }
 
     fn algo(&self, inputs: &[Shape]) -> &'static str {
-        if inputs.len() > 2 { "bias" } else { "no_bias" }
+        match (self.gelu, inputs.len() > 2) {
+            (false, true) => "bias",
+            (false, false) => "no_bias",
+            (true, true) => "gelu_bias",
+            (true, false) => "gelu_no_bias",
+        }
     }
 
     fn flops(&self, inputs: &[Shape]) -> u64 {
@@ -83,27 +148,38 @@ impl<T: Float> Op<T> for Linear {
         let shape = x.shape().with(x.shape().rank() - 1, w.dims()[1]);
         let rows = Rows::dense(x.data(), x.shape().rows(), w.dims()[0]);
         let finish = Finish::new(b.map(|b| b.data()), Activation::None);
-        let y = Tensor::build(shape, |out| forward(out, rows, w.data(), &finish, self.tile));
-        (vec![y], (needs.get(1).then(|| x.clone()), needs.get(0).then(|| w.clone())))
+        let y = Tensor::build(shape, |out| match self.gelu {
+            true => forward_of_gelu(out, rows, w.data(), &finish, self.tile),
+            false => forward(out, rows, w.data(), &finish, self.tile),
+        });
+        let x_matters = needs.get(1) || self.gelu && needs.get(0);
+        (vec![y], (x_matters.then(|| x.clone()), needs.get(0).then(|| w.clone())))
     }
 
-    /// dx = dy w^T, dw = x^T dy, db = the sum of dy's rows.
+    /// dx = dy w^T, dw = x^T dy, db = the sum of dy's rows; behind GELU, dx = dy w^T gelu'(x) and dw = gelu(x)^T dy.
     fn backward(&self, (x, w): Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
         let g = upstream.only();
         let (rows, n) = (g.shape().rows(), g.shape().last());
+        let dy = Rows::dense(g.data(), rows, n);
         if let Some(w) = w {
-            let g = Rows::dense(g.data(), rows, n);
-            sink.accumulate(0, |out, accum| input_gradient(out, accum, g, w.data(), self.tile));
+            sink.accumulate(0, |out, accum| match x.as_ref().filter(|_| self.gelu) {
+                Some(x) => input_gradient_of_gelu(out, accum, x.data(), dy, w.data(), self.tile),
+                None => input_gradient(out, accum, dy, w.data(), self.tile),
+            });
         }
         if let Some(x) = x {
             let k = x.shape().last();
             sink.accumulate(1, |out, accum| {
-                weight_gradient(out, accum, Rows::dense(x.data(), rows, k), Rows::dense(g.data(), rows, n));
+                let h = if self.gelu { apply_gelu(&x) } else { x };
+                weight_gradient(out, accum, Rows::dense(h.data(), rows, k), dy);
             });
         }
         sink.accumulate(2, |out, accum| bias_gradient(out, accum, g.data()));
     }
 }
+
+/// Rows of a product that adds to a weight's gradient.
+const ROWS: usize = 512;
 
 /// `dw = x^T dy` in a fixed number of partial sums, added up in order: the same bits for any number of threads.
 pub(crate) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, x: Rows<T>, g: Rows<T>) {
@@ -112,12 +188,16 @@ pub(crate) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, x: Rows<T>,
     let step = rows.div_ceil(parts).max(1);
     let product = |part: usize, out: &mut [T], accum| {
         let (from, to) = ((part * step).min(rows), ((part + 1) * step).min(rows));
-        let (x, g) = (x.rows(from, to - from), g.rows(from, to - from));
         if accum == Accum::Replace {
             out.fill(T::ZERO);
         }
-        let (terms, count) = (&[(x.data, g.data)], to - from);
-        Gram { out, out_step: n, rows: k, cols: n, terms, count, a_step: x.row_stride, b_step: g.row_stride }.run();
+        // Sums of sums, as far as rounding goes; and what a product reads stays in the cache.
+        for first in (from..to).step_by(ROWS) {
+            let count = ROWS.min(to - first);
+            let (a_step, b_step) = (x.row_stride, g.row_stride);
+            let terms = &[(x.rows(first, count).data, g.rows(first, count).data)];
+            Gram { out, out_step: n, rows: k, cols: n, terms, count, a_step, b_step }.run();
+        }
     };
     if parts == 1 {
         return product(0, out, accum);
@@ -166,7 +246,8 @@ impl Checked for Linear {
         let x = |shape: &[usize]| Input::random("x", shape);
         let w = |k: usize, n: usize| Input::random("w", [k, n]);
         let b = |n: usize| Input::random("b", [n]);
-        let tiled = |tile| Linear { tile };
+        let tiled = |tile| Linear { tile, gelu: false };
+        let gelu = |tile| Linear { tile, gelu: true };
         vec![
             Case::new("with bias", tiled(0), [x(&[2, 3, 5]), w(5, 4), b(4)]),
             Case::new("without bias", tiled(0), [x(&[2, 3, 5]), w(5, 4)]),
@@ -177,6 +258,13 @@ impl Checked for Linear {
             Case::new("partial sums", tiled(0), [x(&[300, 2]), w(2, 3), b(3)]),
             Case::new("partial sums without bias", tiled(0), [x(&[300, 2]), w(2, 3)]),
             Case::new("several register tiles", tiled(0), [x(&[25, 11]), w(11, 17), b(17)]),
+            Case::new("GELU, with bias", gelu(0), [x(&[2, 3, 5]), w(5, 4), b(4)]),
+            Case::new("GELU, without bias", gelu(0), [x(&[2, 3, 5]), w(5, 4)]),
+            Case::new("GELU, tile and one", gelu(4), [x(&[5, 5]), w(5, 2), b(2)]),
+            Case::new("GELU, tiles without bias", gelu(4), [x(&[9, 5]), w(5, 2)]),
+            Case::new("GELU, several register tiles", gelu(0), [x(&[25, 11]), w(11, 17), b(17)]),
+            Case::new("GELU, partial sums", gelu(0), [x(&[300, 2]), w(2, 3), b(3)]),
+            Case::new("GELU, no rows", gelu(0), [x(&[0, 2]), w(2, 3), b(3)]).flat(),
             Case::new("no rows", tiled(0), [x(&[0, 2]), w(2, 3), b(3)]).flat(),
         ]
     }
@@ -189,6 +277,16 @@ impl<T: Float> Var<T> {
         match bias {
             Some(bias) => apply1(Linear::default(), &[self, weight, bias]),
             None => apply1(Linear::default(), &[self, weight]),
+        }
+    }
+
+    /// `gelu(x) [.., in] w [in, out] (+ b [out])`, without ever holding the whole of gelu(x).
+    #[track_caller]
+    pub fn gelu_linear(&self, weight: &Self, bias: Option<&Self>) -> Self {
+        let op = Linear { gelu: true, tile: 0 };
+        match bias {
+            Some(bias) => apply1(op, &[self, weight, bias]),
+            None => apply1(op, &[self, weight]),
         }
     }
 }

@@ -4,7 +4,7 @@
 //! such copy: the window of an output pixel is, for each of its rows, one run of numbers in the image, and the windows
 //! of its neighbours are the same run a step further on. A number of the left operand is spread over a vector and
 //! multiplied with a few vectors of the right one, for ten rows of the result at once, so that twenty sums wait for
-//! each other's additions. Every sum runs over its products in one order, whatever the tile and the instruction set.
+//! each other's additions. Every sum is made in one order, whatever the tile and the instruction set.
 
 use pulp::{Simd, WithSimd};
 
@@ -15,6 +15,9 @@ use super::{Float, simd};
 
 /// Vectors side by side in a tile of the result.
 const VECTORS: usize = 2;
+/// The most terms summed one after the other: rounding errors grow with the length of a sum, so long ones are sums of
+/// sums.
+const LONGEST: usize = 256;
 
 /// The right operand of a product, cut into panels of [`VECTORS`] vectors of columns, one panel after the other, the
 /// last one filled up with zeros.
@@ -123,24 +126,49 @@ impl<T: Float> Product<'_, T> {
 
     #[inline(always)]
     fn tile<S: Simd, const P: usize, const N: usize>(&mut self, simd: S, panel: &[T], at: usize, first: usize) {
-        let (lanes, cols, run) = (T::lanes::<S>(), self.panels.cols, self.run);
+        let (lanes, run) = (T::lanes::<S>(), self.run);
         let mut sums = [[T::splat(simd, T::ZERO); N]; P];
+        let (mut terms, mut accum) = (0, self.accum);
         for (line, b) in self.lines.iter().zip(panel.chunks_exact(run * N * lanes)) {
-            let a: [&[T]; P] = std::array::from_fn(|p| &line[(at + p) * self.step..][..run]);
-            for (j, b) in b.chunks_exact(N * lanes).enumerate() {
-                let b: [_; N] = std::array::from_fn(|q| T::load(simd, &b[q * lanes..]));
-                for p in 0..P {
-                    let x = T::splat(simd, a[p][j]);
-                    for q in 0..N {
-                        sums[p][q] = T::fma(simd, x, b[q], sums[p][q]);
+            for from in (0..run).step_by(LONGEST) {
+                let count = LONGEST.min(run - from);
+                if terms + count > LONGEST {
+                    self.settle(simd, at, first, sums, accum);
+                    sums = [[T::splat(simd, T::ZERO); N]; P];
+                    (terms, accum) = (0, Accum::Add);
+                }
+                terms += count;
+                let a: [&[T]; P] = std::array::from_fn(|p| &line[(at + p) * self.step + from..][..count]);
+                let b = &b[from * N * lanes..][..count * N * lanes];
+                for (j, b) in b.chunks_exact(N * lanes).enumerate() {
+                    let b: [_; N] = std::array::from_fn(|q| T::load(simd, &b[q * lanes..]));
+                    for p in 0..P {
+                        let x = T::splat(simd, a[p][j]);
+                        for q in 0..N {
+                            sums[p][q] = T::fma(simd, x, b[q], sums[p][q]);
+                        }
                     }
                 }
             }
         }
+        self.settle(simd, at, first, sums, accum);
+    }
+
+    /// Writes a tile to where it belongs, or adds it.
+    #[inline(always)]
+    fn settle<S: Simd, const P: usize, const N: usize>(
+        &mut self,
+        simd: S,
+        at: usize,
+        first: usize,
+        sums: [[T::V<S>; N]; P],
+        accum: Accum,
+    ) {
+        let (lanes, cols) = (T::lanes::<S>(), self.panels.cols);
         let out = self.out[at * cols..(at + P) * cols].chunks_exact_mut(cols);
         for (out, sums) in out.zip(sums) {
             for (q, &sum) in sums.iter().enumerate() {
-                settle(simd, &mut out[first + q * lanes..], sum, self.accum);
+                settle(simd, &mut out[first + q * lanes..], sum, accum);
             }
         }
     }
@@ -290,9 +318,14 @@ mod tests {
 
     #[test]
     fn a_product_is_the_sum_it_stands_for() {
-        for (rows, cols, step, run, lines) in
-            [(1, 1, 1, 1, 1), (23, 5, 2, 6, 3), (14, 16, 4, 4, 1), (11, 33, 3, 9, 2), (9, 50, 1, 7, 3)]
-        {
+        for (rows, cols, step, run, lines) in [
+            (1, 1, 1, 1, 1),
+            (23, 5, 2, 6, 3),
+            (14, 16, 4, 4, 1),
+            (11, 33, 3, 9, 2),
+            (9, 50, 1, 7, 3),
+            (11, 3, 2, 600, 2),
+        ] {
             let data = numbers(lines * ((rows - 1) * step + run));
             let lines: Vec<&[f64]> = data.chunks((rows - 1) * step + run).collect();
             let b = numbers(lines.len() * run * cols);
