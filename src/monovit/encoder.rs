@@ -114,7 +114,7 @@ impl JointLayer {
     fn forward<T: Float>(&self, c: &Context<T>, embedded: &[Var<T>]) -> Var<T> {
         let mut parts: Vec<Var<T>> = self.convolutional.iter().map(|path| path.forward(c, &embedded[0])).collect();
         parts.extend(self.transformers.iter().zip(embedded).map(|(path, x)| path.forward(c, x)));
-        self.aggregate.forward(c, &Var::concat(&parts.iter().collect::<Vec<_>>(), 3))
+        self.aggregate.forward_parts(c, &parts.iter().collect::<Vec<_>>())
     }
 }
 

@@ -48,12 +48,18 @@ impl Conv {
         x.conv2d(c.var(self.weight), self.bias.map(|b| c.var(b)), self.op)
     }
 
-    /// The same convolution of `x` times one gate for each channel, `[in]`: the weights take the gate, since there are
-    /// fewer of them than pixels.
+    /// The convolution of images side by side along their channels, `[B, H, W, ..] -> [B, H', W', out]`.
     #[track_caller]
-    pub fn forward_gated<T: Float>(&self, c: &Context<T>, x: &Var<T>, gate: &Var<T>) -> Var<T> {
+    pub fn forward_parts<T: Float>(&self, c: &Context<T>, parts: &[&Var<T>]) -> Var<T> {
+        Var::conv2d_of_parts(parts, c.var(self.weight), self.bias.map(|b| c.var(b)), self.op)
+    }
+
+    /// The same of the images times one gate for each channel, `[in]`: the weights take the gate, since there are fewer
+    /// of them than pixels.
+    #[track_caller]
+    pub fn forward_gated<T: Float>(&self, c: &Context<T>, parts: &[&Var<T>], gate: &Var<T>) -> Var<T> {
         let weight = c.var(self.weight) * gate.reshape([1, 1, gate.shape().len(), 1]);
-        x.conv2d(&weight, self.bias.map(|b| c.var(b)), self.op)
+        Var::conv2d_of_parts(parts, &weight, self.bias.map(|b| c.var(b)), self.op)
     }
 
     /// The same convolution with an activation behind it.
@@ -82,11 +88,17 @@ impl Normalised<Conv> {
     /// `[B, H, W, in] -> [B, H', W', out]`.
     #[track_caller]
     pub fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
+        self.forward_parts(c, &[x])
+    }
+
+    /// The same of images side by side along their channels, `[B, H, W, ..] -> [B, H', W', out]`.
+    #[track_caller]
+    pub fn forward_parts<T: Float>(&self, c: &Context<T>, parts: &[&Var<T>]) -> Var<T> {
         if !c.is_folded() {
-            return self.bn.forward(c, &self.conv.forward(c, x));
+            return self.bn.forward(c, &self.conv.forward_parts(c, parts));
         }
         let op = self.conv.op.activated(self.bn.activation);
-        x.conv2d(c.var(self.conv.weight), Some(c.var(self.bn.bias)), op)
+        Var::conv2d_of_parts(parts, c.var(self.conv.weight), Some(c.var(self.bn.bias)), op)
     }
 }
 

@@ -27,6 +27,8 @@ pub struct ConvRelativePosition {
 
 /// The channels that are computed side by side.
 const LANES: usize = 16;
+/// Pixels of a row that are computed side by side.
+const SIDE_BY_SIDE: usize = 5;
 /// The extent of the largest window that is taken.
 const LARGEST: usize = 15;
 
@@ -156,24 +158,46 @@ impl Plan {
         y: usize,
         mut emit: impl FnMut(usize, usize, [T; LANES]),
     ) {
+        let mut x = 0;
+        while x + SIDE_BY_SIDE <= self.width {
+            self.pixels::<T, SIDE_BY_SIDE>(image, taps, [b, y, x], &mut emit);
+            x += SIDE_BY_SIDE;
+        }
+        while x < self.width {
+            self.pixels::<T, 1>(image, taps, [b, y, x], &mut emit);
+            x += 1;
+        }
+    }
+
+    /// The same of P pixels from x on: as many sums that do not wait for one another.
+    #[inline(always)]
+    fn pixels<T: Float, const P: usize>(
+        &self,
+        image: &[T],
+        taps: &[T],
+        [b, y, x]: [usize; 3],
+        emit: &mut impl FnMut(usize, usize, [T; LANES]),
+    ) {
         let ((image, _), (taps, _)) = (image.as_chunks::<LANES>(), taps.as_chunks::<LANES>());
         let (n, across) = (self.blocks.len(), self.padded_width());
-        for x in 0..self.width {
-            for (k, block) in self.blocks.iter().enumerate() {
-                let (window, ring) = (block.window, self.pad - block.window / 2);
-                let taps = &taps[block.from..][..window * window];
-                let top = (b * self.padded_height() + y + ring) * across + x + ring;
-                let mut sum = [T::ZERO; LANES];
-                for (dy, taps) in taps.chunks_exact(window).enumerate() {
-                    let pixels = &image[(top + dy * across) * n + k..][..(window - 1) * n + 1];
-                    for (dx, tap) in taps.iter().enumerate() {
-                        let pixel = &pixels[dx * n];
+        for (k, block) in self.blocks.iter().enumerate() {
+            let (window, ring) = (block.window, self.pad - block.window / 2);
+            let taps = &taps[block.from..][..window * window];
+            let top = (b * self.padded_height() + y + ring) * across + x + ring;
+            let mut sums = [[T::ZERO; LANES]; P];
+            for (dy, taps) in taps.chunks_exact(window).enumerate() {
+                let pixels = &image[(top + dy * across) * n + k..][..(window + P - 2) * n + 1];
+                for (dx, tap) in taps.iter().enumerate() {
+                    for (p, sum) in sums.iter_mut().enumerate() {
+                        let pixel = &pixels[(dx + p) * n];
                         for (s, (&p, &t)) in sum.iter_mut().zip(pixel.iter().zip(tap)) {
                             *s = p.mul_add(t, *s);
                         }
                     }
                 }
-                emit(x, k, sum);
+            }
+            for (p, sum) in sums.into_iter().enumerate() {
+                emit(x + p, k, sum);
             }
         }
     }

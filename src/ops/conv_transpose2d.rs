@@ -2,6 +2,7 @@
 
 use super::conv2d::geometry::Geometry;
 use super::conv2d::kernel;
+use super::conv2d::parts::whole;
 use super::fused::Finish;
 use super::{Case, Checked, Input, Needs, Op, ShapeError, apply1, linear};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
@@ -139,10 +140,12 @@ impl<T: Float> Op<T> for ConvTranspose2d {
     fn backward(&self, (x, w, g): Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
         let dy = upstream.only();
         if let Some(w) = w {
-            sink.accumulate(0, |out, accum| kernel::convolve(out, accum, &g, dy.data(), w.data(), &Finish::nothing()));
+            sink.accumulate(0, |out, accum| {
+                kernel::convolve(out, accum, &g, &whole(&g, dy.data()), w.data(), &Finish::nothing())
+            });
         }
         if let Some(x) = x {
-            sink.accumulate(1, |out, accum| kernel::weight_gradient(out, accum, &g, dy.data(), x.data()));
+            sink.accumulate(1, |out, accum| kernel::weight_gradient(out, accum, &g, &whole(&g, dy.data()), x.data()));
         }
         sink.accumulate(2, |out, accum| linear::bias_gradient(out, accum, dy.data()));
     }

@@ -5,7 +5,7 @@ use super::unary::{Function, Gelu};
 use super::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::gemm::Rows;
 use crate::tensor::pool::Buffer;
-use crate::tensor::register_tile::{Gram, Panels, Product};
+use crate::tensor::register_tile::{Gram, Line, Panels, Product};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
 /// `y [.., out] = x [.., in] w [in, out] (+ b [out])`. A 1x1 convolution is the same thing.
@@ -23,16 +23,17 @@ fn tile_rows(tile: usize, k: usize, n: usize) -> usize {
     if tile > 0 { tile } else { ((1 << 17) / (k * n).max(1)).clamp(40, 1000).next_multiple_of(20) }
 }
 
-/// `out = x w`, finished.
-pub(super) fn forward<T: Float>(out: &mut [T], x: Rows<T>, w: &[T], finish: &Finish<T>, tile: usize) {
-    let k = x.cols;
-    let n = out.len() / x.rows.max(1);
+/// `out = x w`, finished; x may come in parts, whose columns stand side by side.
+pub(super) fn forward<T: Float>(out: &mut [T], parts: &[Rows<T>], w: &[T], finish: &Finish<T>, tile: usize) {
+    let k = parts.iter().map(|x| x.cols).sum();
+    let n = out.len() / parts[0].rows.max(1);
     let tile = tile_rows(tile, k, n);
     let work = 2 * out.len() * k;
     let panels = Panels::dense(w, k, n);
     parallel::for_each_chunk(out, tile * n, work, |i, out| {
         let rows = out.len() / n;
-        product(out, Accum::Replace, x.rows(i * tile, rows), &panels);
+        let lines: Vec<Line<T>> = parts.iter().map(|x| line(x.rows(i * tile, rows))).collect();
+        Product { out, accum: Accum::Replace, lines: &lines, panels: &panels }.run();
         finish.run(out);
     });
 }
@@ -107,7 +108,12 @@ pub(crate) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, dy: Rows<T>,
 
 /// `out = x panels`, or added to what is there.
 fn product<T: Float>(out: &mut [T], accum: Accum, x: Rows<T>, panels: &Panels<T>) {
-    Product { out, accum, lines: &[x.data], step: x.row_stride, run: x.cols, panels }.run();
+    Product { out, accum, lines: &[line(x)], panels }.run();
+}
+
+/// Rows as the left operand of a product.
+fn line<T: Float>(x: Rows<'_, T>) -> Line<'_, T> {
+    Line { data: x.data, step: x.row_stride, run: x.cols }
 }
 
 /// How many partial sums a weight gradient is made of: depends on the shape alone.
@@ -150,7 +156,7 @@ impl<T: Float> Op<T> for Linear {
         let finish = Finish::new(b.map(|b| b.data()), Activation::None);
         let y = Tensor::build(shape, |out| match self.gelu {
             true => forward_of_gelu(out, rows, w.data(), &finish, self.tile),
-            false => forward(out, rows, w.data(), &finish, self.tile),
+            false => forward(out, &[rows], w.data(), &finish, self.tile),
         });
         let x_matters = needs.get(1) || self.gelu && needs.get(0);
         (vec![y], (x_matters.then(|| x.clone()), needs.get(0).then(|| w.clone())))

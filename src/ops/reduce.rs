@@ -153,7 +153,16 @@ fn sum_rows_here<T: Float>(out: &mut [T], x: &[T]) {
     let (cols, rows) = (out.len(), x.len() / out.len());
     out.fill(T::ZERO);
     if rows <= BLOCK {
-        for row in x.chunks_exact(cols) {
+        // Four rows at a time: each addition to `out` waits for the one before.
+        let mut fours = x.chunks_exact(4 * cols);
+        for four in &mut fours {
+            let (first, last) = four.split_at(2 * cols);
+            let (a, b) = first.split_at(cols);
+            let (c, d) = last.split_at(cols);
+            let rows = a.iter().zip(b).zip(c.iter().zip(d));
+            out.iter_mut().zip(rows).for_each(|(s, ((&a, &b), (&c, &d)))| *s += (a + b) + (c + d));
+        }
+        for row in fours.remainder().chunks_exact(cols) {
             out.iter_mut().zip(row).for_each(|(s, &x)| *s += x);
         }
         return;

@@ -72,15 +72,21 @@ impl<T: Float> Panels<T> {
     }
 }
 
-/// `out = A B`, or added to what is there: row p of A is the concatenation of `line[p * step..][..run]` over the lines.
+/// Some columns of a left operand: row p is `data[p * step..][..run]`.
+#[derive(Clone, Copy)]
+pub(crate) struct Line<'a, T> {
+    pub(crate) data: &'a [T],
+    pub(crate) step: usize,
+    pub(crate) run: usize,
+}
+
+/// `out = A B`, or added to what is there: the columns of A are those of the lines, one line after the other.
 ///
 /// `out` has rows of as many numbers as B has columns.
 pub(crate) struct Product<'a, T: Float> {
     pub(crate) out: &'a mut [T],
     pub(crate) accum: Accum,
-    pub(crate) lines: &'a [&'a [T]],
-    pub(crate) step: usize,
-    pub(crate) run: usize,
+    pub(crate) lines: &'a [Line<'a, T>],
     pub(crate) panels: &'a Panels<T>,
 }
 
@@ -91,7 +97,8 @@ impl<T: Float> Product<'_, T> {
     /// If a line is too short, or B has not as many rows as A has columns.
     pub(crate) fn run(self) {
         let Panels { rows, cols, .. } = *self.panels;
-        assert_eq!(rows, self.lines.len() * self.run, "rows of the right operand");
+        let columns: usize = self.lines.iter().map(|line| line.run).sum();
+        assert_eq!(rows, columns, "rows of the right operand");
         if cols == 0 || self.out.is_empty() {
             return;
         }
@@ -126,10 +133,13 @@ impl<T: Float> Product<'_, T> {
 
     #[inline(always)]
     fn tile<S: Simd, const P: usize, const N: usize>(&mut self, simd: S, panel: &[T], at: usize, first: usize) {
-        let (lanes, run) = (T::lanes::<S>(), self.run);
+        let lanes = T::lanes::<S>();
         let mut sums = [[T::splat(simd, T::ZERO); N]; P];
         let (mut terms, mut accum) = (0, self.accum);
-        for (line, b) in self.lines.iter().zip(panel.chunks_exact(run * N * lanes)) {
+        let mut rest = panel;
+        for Line { data, step, run } in self.lines.iter().copied() {
+            let (b, others) = rest.split_at(run * N * lanes);
+            rest = others;
             for from in (0..run).step_by(LONGEST) {
                 let count = LONGEST.min(run - from);
                 if terms + count > LONGEST {
@@ -138,7 +148,7 @@ impl<T: Float> Product<'_, T> {
                     (terms, accum) = (0, Accum::Add);
                 }
                 terms += count;
-                let a: [&[T]; P] = std::array::from_fn(|p| &line[(at + p) * self.step + from..][..count]);
+                let a: [&[T]; P] = std::array::from_fn(|p| &data[(at + p) * step + from..][..count]);
                 let b = &b[from * N * lanes..][..count * N * lanes];
                 for (j, b) in b.chunks_exact(N * lanes).enumerate() {
                     let b: [_; N] = std::array::from_fn(|q| T::load(simd, &b[q * lanes..]));
@@ -327,24 +337,44 @@ mod tests {
             (11, 3, 2, 600, 2),
         ] {
             let data = numbers(lines * ((rows - 1) * step + run));
-            let lines: Vec<&[f64]> = data.chunks((rows - 1) * step + run).collect();
+            let lines = data.chunks((rows - 1) * step + run).map(|data| Line { data, step, run });
+            let lines: Vec<Line<f64>> = lines.collect();
             let b = numbers(lines.len() * run * cols);
             let panels = Panels::dense(&b, lines.len() * run, cols);
             let expected = |p: usize, n: usize| -> f64 {
                 let terms = lines
                     .iter()
                     .enumerate()
-                    .flat_map(|(l, line)| (0..run).map(move |j| (line[p * step + j], l * run + j)));
+                    .flat_map(|(l, line)| (0..run).map(move |j| (line.data[p * step + j], l * run + j)));
                 terms.map(|(a, k)| a * b[k * cols + n]).sum()
             };
             for (accum, start) in [(Accum::Replace, 0.0), (Accum::Add, 0.5)] {
                 let mut out = vec![if accum == Accum::Add { start } else { f64::NAN }; rows * cols];
-                Product { out: &mut out, accum, lines: &lines, step, run, panels: &panels }.run();
+                Product { out: &mut out, accum, lines: &lines, panels: &panels }.run();
                 for (i, &found) in out.iter().enumerate() {
                     let expected = start + expected(i / cols, i % cols);
                     assert!((found - expected).abs() < 1e-12, "{rows}x{cols}, {i}: {found} for {expected}");
                 }
             }
+        }
+    }
+
+    #[test]
+    fn lines_may_differ_in_length_and_step() {
+        let (rows, cols, runs) = (13, 19, [3, 0, 270, 1]);
+        let steps = runs.map(|run| run + 2);
+        let data = steps.map(|step| numbers(rows * step));
+        let lines: Vec<Line<f64>> =
+            (0..runs.len()).map(|l| Line { data: &data[l], step: steps[l], run: runs[l] }).collect();
+        let b = numbers(274 * cols);
+        let panels = Panels::dense(&b, 274, cols);
+        let mut out = vec![f64::NAN; rows * cols];
+        Product { out: &mut out, accum: Accum::Replace, lines: &lines, panels: &panels }.run();
+        for (i, &found) in out.iter().enumerate() {
+            let (p, n) = (i / cols, i % cols);
+            let row = (0..runs.len()).flat_map(|l| &data[l][p * steps[l]..][..runs[l]]);
+            let expected: f64 = row.enumerate().map(|(k, a)| a * b[k * cols + n]).sum();
+            assert!((found - expected).abs() < 1e-12, "{i}: {found} for {expected}");
         }
     }
 

@@ -90,5 +90,5 @@ fn a_number_that_is_not_finite_stops_the_step_and_names_the_op() {
     let id = trainer.params.find("encoder.mhca_stages.1.aggregate.conv.weight").expect("a weight");
     trainer.params.value_mut(id).data_mut()[0] = f32::NAN;
     let error = trainer.step(&batch).expect_err("not finite").to_string();
-    assert!(error.contains("step 1") && error.contains("conv2d [pointwise]"), "{error}");
+    assert!(error.contains("step 1") && error.contains("conv2d [parts_pointwise]"), "{error}");
 }

@@ -59,9 +59,9 @@ pub fn measure(job: &mut impl Job, iterations: usize, listen: bool) -> Result<Me
 /// A training step, or the disparities of its pictures.
 pub struct Network {
     trainer: Trainer,
-    folded: Folded<f32>,
     batch: Batch,
-    step: bool,
+    /// For inference; a step has no use for weights twice.
+    folded: Option<Folded<f32>>,
 }
 
 impl Network {
@@ -73,16 +73,15 @@ impl Network {
         config.loss.auto_mask_after = 0;
         config.loss.shake.keep = 0;
         let trainer = Trainer::new(config.model(), config.optim, config.loss, 0);
-        Ok(Network { folded: Folded::new(&trainer.params), trainer, batch: batch(sizes), step })
+        let folded = (!step).then(|| Folded::new(&trainer.params));
+        Ok(Network { trainer, batch: batch(sizes), folded })
     }
 }
 
 impl Job for Network {
     fn once(&mut self) -> Result<()> {
-        if self.step {
-            return self.trainer.step(&self.batch).map(drop);
-        }
-        self.trainer.model.predict(&self.folded, &self.batch.seen[1]);
+        let Some(folded) = &self.folded else { return self.trainer.step(&self.batch).map(drop) };
+        self.trainer.model.predict(folded, &self.batch.seen[1]);
         Ok(())
     }
 }

@@ -161,7 +161,7 @@ fn fill(world: &mut World, draw: &mut Draw, style: &Style, [side, front, behind]
         };
         world.add(draw, shape, material, [low, GROUND_Y, z]);
     }
-    if gap > 2.5 && draw.chance(0.6) {
+    if gap > 2.5 && draw.chance(0.3) {
         let x = side * (front + draw.range(2.5, 5.0));
         props::tree(world, draw, style, x, z + 0.5 * gap, 1.3);
     }

@@ -2,7 +2,7 @@
 //!
 //! It stands in for a recorded dataset where there is none: a training run starts with no download, and every claim
 //! about geometry can be checked, since the truth is known. `world` says what stands where, `camera` how the car moves,
-//! `shape` where rays meet solids, `surface` and `light` what they look like there, `render` puts it into pictures,
+//! `shape` where rays meet solids, `surface`, `weather` and `light` what they look like there, `render` puts it into pictures,
 //! `dataset` and `export` hand them out. The world's frame has x right, y down, z along the street, in metres; the first
 //! camera is at its origin, and the road at y = 1.65.
 
@@ -17,6 +17,7 @@ mod render;
 mod shape;
 mod surface;
 mod texture;
+mod weather;
 mod world;
 
 pub use camera::Pose;

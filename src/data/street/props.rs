@@ -12,12 +12,12 @@ const PAINTS: [[f64; 3]; 10] = [
     [0.80, 0.80, 0.80],
     [0.72, 0.73, 0.75],
     [0.55, 0.56, 0.58],
-    [0.22, 0.23, 0.25],
-    [0.14, 0.14, 0.16],
-    [0.50, 0.12, 0.12],
-    [0.14, 0.24, 0.45],
+    [0.34, 0.35, 0.37],
+    [0.26, 0.26, 0.28],
+    [0.56, 0.22, 0.20],
+    [0.24, 0.34, 0.52],
     [0.25, 0.36, 0.44],
-    [0.20, 0.30, 0.22],
+    [0.28, 0.38, 0.30],
     [0.62, 0.55, 0.42],
 ];
 
@@ -59,9 +59,9 @@ pub(crate) fn traffic(world: &mut World, draw: &mut Draw, frames: usize) {
 
 /// A car around `x` from `z` on, seen from behind if `away`; gives its length.
 fn car(world: &mut World, draw: &mut Draw, x: f64, z: f64, away: bool, speed: f64) -> f64 {
-    let van = draw.chance(0.2);
+    let van = draw.chance(0.4);
     let length = if van { draw.range(4.6, 6.0) } else { draw.range(3.6, 4.8) };
-    let height = if van { draw.range(1.9, 2.4) } else { draw.range(1.4, 1.65) };
+    let height = if van { draw.range(1.75, 2.4) } else { draw.range(1.4, 1.65) };
     let half = 0.5 * draw.range(1.68, 2.0 * HALF_CAR);
     let first = world.solids.len();
     let up = |h: f64| GROUND_Y - h;
@@ -156,7 +156,7 @@ pub(crate) fn poles(world: &mut World, draw: &mut Draw, style: &Style, side: f64
                 world.add(draw, shape, Material::Sign(colour), origin);
             }
         }
-        z += draw.range(7.0, 16.0);
+        z += draw.range(9.0, 22.0);
     }
 }
 

@@ -3,6 +3,7 @@
 
 use super::light::GROUND;
 use super::texture::{Patch, band, fade, floor, hash, hash_unit, mix, noise3, pulse, pulse_centred, scale};
+use super::weather::weathered;
 
 /// A colour: red, green, blue.
 pub(crate) type Colour = [f32; 3];
@@ -115,6 +116,15 @@ pub(crate) enum Material {
 impl Material {
     /// The colour at a point, before the light.
     pub(crate) fn colour(&self, p: &Point, seed: u32) -> Colour {
+        let clean = self.clean(p, seed);
+        match self {
+            // Leaves are patches all over.
+            Material::Leaves(_) => clean,
+            _ => weathered(clean, &p.patch(), seed.wrapping_add(900)),
+        }
+    }
+
+    fn clean(&self, p: &Point, seed: u32) -> Colour {
         match self {
             Material::Road(road) => road.colour(p, seed),
             Material::Pavement { stone, yard, slab, edge } => pavement(p, *stone, *yard, *slab, *edge, seed),
@@ -402,7 +412,7 @@ impl Car {
         let sheen = patch.octaves(&[(0.8, 0.42), (2.0, 0.34), (5.0, 0.26)], seed + 3);
         let paint = scale(self.paint, 1.0 + sheen);
         // `y` is below the roof.
-        let glass = scale([0.16, 0.19, 0.22], (1.5 - 1.1 * y) * (1.0 + 1.8 * sheen));
+        let glass = scale([0.24, 0.28, 0.32], (1.5 - 1.1 * y) * (1.0 + 1.8 * sheen));
         if p.axis == 1 {
             let rails = band(x.abs(), 0.5, 0.54, fx);
             return scale(paint, 1.1 - 0.5 * rails);

@@ -1,16 +1,16 @@
 //! Convolution without an im2col matrix: windows are read from padded rows of the image where they lie.
 //!
-//! A row of the image with its padding is copied once; the windows of the output pixels of a row are then runs of it,
+//! A row of the image with its padding is copied once, from all its parts; the windows of the output pixels of a row are then runs of it,
 //! a stride apart, for each row of the window. That is a product whose left operand needs no memory of its own
 //! ([`register_tile`](crate::tensor::register_tile)), where im2col writes every number as often as windows overlap.
 
 use std::ops::Range;
 
 use super::geometry::Geometry;
+use super::parts::{Part, copy_pixels};
 use crate::ops::fused::Finish;
 use crate::tensor::pool::Buffer;
-use crate::tensor::register_tile::{Gram, Panels, Product};
-use crate::tensor::simd::copy_run;
+use crate::tensor::register_tile::{Gram, Line, Panels, Product};
 use crate::tensor::{Accum, Float, parallel, simd};
 
 /// The rows of one image that some rows of the output see, with their padding.
@@ -21,9 +21,9 @@ struct Band<T: Float> {
 }
 
 impl<T: Float> Band<T> {
-    /// What the output rows `rows` of one image see.
-    fn new(g: &Geometry, image: &[T], rows: Range<usize>) -> Self {
-        let (c, width) = (g.channels, g.size[1]);
+    /// What the output rows `rows` of image `b` see.
+    fn new(g: &Geometry, x: &[Part<T>], b: usize, rows: Range<usize>) -> Self {
+        let (c, [height_in, width]) = (g.channels, g.size);
         let cells = (g.out[1] - 1) * g.stride[1] + g.kernel[1];
         let height = (rows.len() - 1) * g.stride[0] + (g.kernel[0] - 1) * g.dilation[0] + 1;
         let line = cells * c;
@@ -37,12 +37,13 @@ impl<T: Float> Band<T> {
                         out.fill(T::ZERO);
                         continue;
                     };
-                    let row = &image[y * width * c..(y + 1) * width * c];
-                    copy_run(&mut out[inside.start * c..inside.end * c], &row[..inside.len() * c]);
+                    let row = (b * height_in + y) * width;
+                    copy_pixels(&mut out[inside.start * c..inside.end * c], x, row, inside.len());
                     for at in (0..inside.start).chain(inside.end..cells) {
+                        let out = &mut out[at * c..(at + 1) * c];
                         match g.padded(1, at) {
-                            Some(x) => copy_run(&mut out[at * c..(at + 1) * c], &row[x * c..(x + 1) * c]),
-                            None => out[at * c..(at + 1) * c].fill(T::ZERO),
+                            Some(column) => copy_pixels(out, x, row + column, 1),
+                            None => out.fill(T::ZERO),
                         }
                     }
                 }
@@ -58,20 +59,31 @@ impl<T: Float> Band<T> {
 }
 
 /// Calls `f(band, image, output rows in the image)` for output rows of the whole batch, image by image.
-fn for_each_band<T: Float>(g: &Geometry, x: &[T], rows: Range<usize>, mut f: impl FnMut(Band<T>, usize, Range<usize>)) {
-    let image = g.size[0] * g.size[1] * g.channels;
+fn for_each_band<T: Float>(
+    g: &Geometry,
+    x: &[Part<T>],
+    rows: Range<usize>,
+    mut f: impl FnMut(Band<T>, usize, Range<usize>),
+) {
     let mut first = rows.start;
     while first < rows.end {
         let b = first / g.out[0];
         let end = rows.end.min((b + 1) * g.out[0]);
         let mine = first - b * g.out[0]..end - b * g.out[0];
-        f(Band::new(g, &x[b * image..(b + 1) * image], mine.clone()), b, mine);
+        f(Band::new(g, x, b, mine.clone()), b, mine);
         first = end;
     }
 }
 
 /// `out = conv(x, w)`, or added to what is there; and finished.
-pub(super) fn convolve<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: &[T], w: &[T], finish: &Finish<T>) {
+pub(super) fn convolve<T: Float>(
+    out: &mut [T],
+    accum: Accum,
+    g: &Geometry,
+    x: &[Part<T>],
+    w: &[T],
+    finish: &Finish<T>,
+) {
     let (n, width, tile) = (g.out_channels, g.out[1], g.tile());
     let panels = Panels::dense(w, g.patch(), n);
     let (step, run) = (g.stride[1] * g.channels, g.kernel[1] * g.channels);
@@ -81,10 +93,11 @@ pub(super) fn convolve<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: &
         let mut rest = &mut *out;
         for_each_band(g, x, first..first + rest.len() / (width * n), |band, _, rows| {
             for r in 0..rows.len() {
-                let lines: Vec<&[T]> = (0..g.kernel[0]).map(|ky| band.line(g, r, ky)).collect();
+                let lines = (0..g.kernel[0]).map(|ky| Line { data: band.line(g, r, ky), step, run });
+                let lines: Vec<Line<T>> = lines.collect();
                 let (out, others) = std::mem::take(&mut rest).split_at_mut(width * n);
                 rest = others;
-                Product { out, accum, lines: &lines, step, run, panels: &panels }.run();
+                Product { out, accum, lines: &lines, panels: &panels }.run();
             }
         });
         finish.run(out);
@@ -101,7 +114,7 @@ pub(super) fn is_better_transposed(g: &Geometry) -> bool {
 pub(super) fn add_weight_gradient<T: Float>(
     sum: &mut [T],
     g: &Geometry,
-    x: &[T],
+    x: &[Part<T>],
     dy: &[T],
     rows: Range<usize>,
     transposed: bool,

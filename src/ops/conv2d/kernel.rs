@@ -2,6 +2,7 @@
 
 use super::direct;
 use super::geometry::Geometry;
+use super::parts::{Part, in_one_piece, whole};
 use crate::ops::fused::Finish;
 use crate::ops::linear::sum_into;
 use crate::tensor::gemm::{Rows, RowsMut, gemm};
@@ -57,12 +58,12 @@ pub(in crate::ops) fn convolve<T: Float>(
     out: &mut [T],
     accum: Accum,
     g: &Geometry,
-    x: &[T],
+    x: &[Part<T>],
     w: &[T],
     finish: &Finish<T>,
 ) {
     match g.side_by_side() {
-        _ if !g.is_direct() => product(out, accum, g, x, w, finish),
+        _ if !g.is_direct() => product(out, accum, g, in_one_piece(g, x, &mut None), w, finish),
         1 => direct::convolve(out, accum, g, x, w, finish),
         s => direct::convolve(out, accum, &g.widened(s), x, &widened(g, s, w), finish),
     }
@@ -130,7 +131,7 @@ pub(in crate::ops) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, g: &
     match g.transposed() {
         Some(t) => {
             let turned = turned(g, w);
-            convolve(out, accum, &t, dy, &turned, &Finish::nothing());
+            convolve(out, accum, &t, &whole(&t, dy), &turned, &Finish::nothing());
             if g.reflect {
                 mirrored_border(out, g, &t, dy, &turned);
             }
@@ -197,6 +198,16 @@ fn gather_patch<T: Float>(g: &Geometry, image: &[T], oy: usize, ox: usize, group
     }
 }
 
+/// The weights that see some of the channels, from `first` on as many as `g` has: `[kh, kw, channels, out]`.
+pub(super) fn weights_of<T: Float>(g: &Geometry, first: usize, channels: usize, w: &[T]) -> Buffer<T> {
+    let mut out = Buffer::stale(g.kernel[0] * g.kernel[1] * g.channels * g.out_channels);
+    let taps = w.chunks_exact((channels * g.out_channels).max(1));
+    for (out, w) in out.chunks_exact_mut((g.channels * g.out_channels).max(1)).zip(taps) {
+        out.copy_from_slice(&w[first * g.out_channels..][..out.len()]);
+    }
+    out
+}
+
 /// dx where it is no convolution (strided): the gradients of patches, added to the pixels they were copied from.
 /// Patches overlap, so an image belongs to one thread.
 fn scatter<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, dy: &[T], w: &[T]) {
@@ -234,11 +245,13 @@ fn scatter<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, dy: &[T], w: &[T
 }
 
 /// dw: the sum over pixels of patch^T dy, in a fixed number of partial sums.
-pub(in crate::ops) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: &[T], dy: &[T]) {
+pub(in crate::ops) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: &[Part<T>], dy: &[T]) {
     let (n, patch, tile) = (g.out_channels, g.patch(), g.tile());
     let tiles = g.rows().div_ceil(tile);
     let parts = tiles.clamp(1, PARTS);
     let transposed = g.is_direct() && direct::is_better_transposed(g);
+    let mut room = None;
+    let image = if g.is_direct() { &[] } else { in_one_piece(g, x, &mut room) };
     let partial = |part: usize, sum: &mut [T]| {
         sum.fill(T::ZERO);
         for first in (part * tiles / parts..(part + 1) * tiles / parts).map(|t| t * tile) {
@@ -246,7 +259,7 @@ pub(in crate::ops) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, g: 
             if g.is_direct() {
                 direct::add_weight_gradient(sum, g, x, dy, first..first + rows, transposed);
             } else {
-                add_weight_gradient(sum, g, x, dy, first, rows);
+                add_weight_gradient(sum, g, image, dy, first, rows);
             }
         }
     };

@@ -230,7 +230,7 @@ pub static ALL: &[Mutant] = &[
     }),
     bug("cotangent", "conv2d", "the bias counts pixels", |b| {
         let rows = b.g().shape().rows() as f64;
-        b.changed(2, |d| d.data_mut().fill(rows))
+        b.changed(b.op::<Conv2d>().parts + 1, |d| d.data_mut().fill(rows))
     }),
     bug("cotangent", "exp", "as if a sum were the loss", |b| b.at(b.inputs, &[Tensor::full(*b.g().shape(), 1.0)])),
     bug("cotangent", "square", "its absolute value", |b| b.at(b.inputs, &[b.g().map(f64::abs)])),
@@ -267,9 +267,9 @@ pub static ALL: &[Mutant] = &[
     handed(Overwriting, "fan-out", "gather", "overwrites what another use gave", |b| b.right()),
     // Groups.
     bug("groups", "conv2d", "the group of an output is its number modulo groups", |b| {
-        let groups = b.op::<Conv2d>().groups;
-        let out = b.x(1).shape().last();
-        b.changed(1, |d| {
+        let Conv2d { groups, parts, .. } = *b.op::<Conv2d>();
+        let out = b.x(parts).shape().last();
+        b.changed(parts, |d| {
             for row in d.data_mut().chunks_exact_mut(out) {
                 let right = row.to_vec();
                 (0..out).for_each(|o| row[o] = right[(o % groups) * (out / groups) + o / groups]);
@@ -343,8 +343,9 @@ pub static ALL: &[Mutant] = &[
     // Layout.
     bug("layout", "conv2d", "the window not turned", |b| {
         let mut inputs = b.inputs.to_vec();
-        let block = inputs[1].dims()[2] * inputs[1].dims()[3];
-        inputs[1] = turned(&inputs[1], block);
+        let weights = &mut inputs[b.op::<Conv2d>().parts];
+        let block = weights.dims()[2] * weights.dims()[3];
+        *weights = turned(weights, block);
         keep(b, 0, b.at(&inputs, &b.upstream))
     }),
     bug("layout", "linear", "weights as if transposed", |b| {
