@@ -65,7 +65,9 @@ pub fn assert_taylor(sizes: Config, loss: &LossConfig, prefixes: &[&str]) {
     let (c, found) = total(&model, &params, &tape, &batch, loss);
     let gradients = c.gradients(&mut found.backward());
     for &prefix in prefixes {
-        // A direction may cross a kink (a pixel changes the source that explains it best), so the middle one of many.
+        // Many directions cross a kink (a pixel changes the source that explains it best), which bends the remainder to
+        // between the first and the second power of the step. Those that cross none show the second; with a wrong
+        // gradient none does. So what counts is the third largest of eleven.
         let mut slopes = [[0.0; 2]; DIRECTIONS];
         for (seed, slopes) in slopes.iter_mut().enumerate() {
             let d = direction(&params, prefix, seed as u64);
@@ -83,13 +85,11 @@ pub fn assert_taylor(sizes: Config, loss: &LossConfig, prefixes: &[&str]) {
                 (remainder(large, STEPS[0]) / remainder(small, STEPS[1])).ln() / (STEPS[0] / STEPS[1]).ln()
             });
         }
-        let middle = |which: usize| {
+        let [right, wrong] = [0, 1].map(|which| {
             let mut all = slopes.map(|s| s[which]);
             all.sort_by(f64::total_cmp);
-            println!("{all:.2?}");
-            all[DIRECTIONS / 2]
-        };
-        let (right, wrong) = (middle(0), middle(1));
+            all[DIRECTIONS - 3]
+        });
         println!("{prefix:14} slope {right:.2}; with a gradient off by 5 %: {wrong:.2}");
         assert!(right > 1.7, "{prefix}: slope {right}");
         assert!(wrong < 1.3, "{prefix}: a wrong gradient has slope {wrong}");
@@ -99,4 +99,4 @@ pub fn assert_taylor(sizes: Config, loss: &LossConfig, prefixes: &[&str]) {
 /// Directions of each group of parameters.
 const DIRECTIONS: usize = 11;
 /// How far along each.
-const STEPS: [f64; 2] = [0.02, 0.002];
+const STEPS: [f64; 2] = [0.1, 0.01];

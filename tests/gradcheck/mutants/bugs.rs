@@ -348,6 +348,18 @@ pub static ALL: &[Mutant] = &[
         *weights = turned(weights, block);
         keep(b, 0, b.at(&inputs, &b.upstream))
     }),
+    bug("layout", "conv2d", "the last part sees the weights of the first", |b| {
+        let parts = b.op::<Conv2d>().parts;
+        if parts == 1 {
+            return b.right();
+        }
+        let mut inputs = b.inputs.to_vec();
+        let last = inputs[parts - 1].shape().last();
+        let [channels, out] = [2, 3].map(|d| inputs[parts].dims()[d]);
+        let taps = inputs[parts].data_mut().chunks_exact_mut((channels * out).max(1));
+        taps.for_each(|tap| tap.rotate_right((channels - last) * out));
+        keep(b, parts - 1, b.at(&inputs, &b.upstream))
+    }),
     bug("layout", "linear", "weights as if transposed", |b| {
         let (k, n) = (b.x(1).dims()[0], b.x(1).dims()[1]);
         let mut inputs = b.inputs.to_vec();
