@@ -215,16 +215,26 @@ pub(crate) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, x: Rows<T>,
 
 /// Adds up partial sums in order.
 pub(crate) fn sum_into<T: Float>(out: &mut [T], accum: Accum, parts: &[Tensor<T>]) {
-    let mut parts = parts.iter();
-    if accum == Accum::Replace {
-        match parts.next() {
-            Some(first) => out.copy_from_slice(first.data()),
-            None => out.fill(T::ZERO),
-        }
-    }
-    for part in parts {
-        out.iter_mut().zip(part.data()).for_each(|(s, &x)| *s += x);
-    }
+    const CHUNK: usize = 1 << 14;
+    let work = out.len() * parts.len();
+    parallel::for_each_chunk(out, CHUNK, work, |i, out| {
+        let range = i * CHUNK..i * CHUNK + out.len();
+        let mut parts = parts.iter().map(|part| &part.data()[range.clone()]);
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                if accum == Accum::Replace {
+                    match parts.next() {
+                        Some(first) => out.copy_from_slice(first),
+                        None => out.fill(T::ZERO),
+                    }
+                }
+                for part in parts {
+                    out.iter_mut().zip(part).for_each(|(s, &x)| *s += x);
+                }
+            },
+        );
+    });
 }
 
 /// The sum of the rows of `g`, in blocks: the same bits for any number of threads.

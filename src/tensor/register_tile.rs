@@ -11,7 +11,7 @@ use pulp::{Simd, WithSimd};
 use super::gemm::Accum;
 use super::pool::Buffer;
 use super::simd::{copy_run, dispatch_vector};
-use super::{Float, simd};
+use super::{Float, parallel, simd};
 
 /// Vectors side by side in a tile of the result.
 const VECTORS: usize = 2;
@@ -49,24 +49,25 @@ impl<T: Float> Panels<T> {
 
     /// `fill(first, width, step, panel)` writes `width` columns from `first` on into rows of `step` numbers.
     #[inline(always)]
-    fn pack(rows: usize, cols: usize, fill: impl Fn(usize, usize, usize, &mut [T])) -> Self {
+    fn pack(rows: usize, cols: usize, fill: impl Fn(usize, usize, usize, &mut [T]) + Sync + Send) -> Self {
         let lanes = simd::lanes::<T>();
         let wide = VECTORS * lanes;
         let mut data = Buffer::stale(rows * cols.next_multiple_of(lanes));
+        let work = data.len() / 4;
         if rows > 0 {
-            simd::dispatch(
-                #[inline(always)]
-                || {
-                    for (k, panel) in data.chunks_mut(wide * rows).enumerate() {
-                        let (first, step) = (k * wide, panel.len() / rows);
-                        let width = step.min(cols - first);
+            parallel::for_each_chunk(&mut data, wide * rows, work, |k, panel| {
+                let (first, step) = (k * wide, panel.len() / rows);
+                let width = step.min(cols - first);
+                simd::dispatch(
+                    #[inline(always)]
+                    || {
                         if width < step {
                             panel.fill(T::ZERO);
                         }
                         fill(first, width, step, panel);
-                    }
-                },
-            );
+                    },
+                );
+            });
         }
         Panels { data, rows, cols, lanes }
     }

@@ -115,16 +115,25 @@ fn product<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: &[T], w: &[T]
 fn turned<T: Float>(g: &Geometry, w: &[T]) -> Buffer<T> {
     let (cg, ng, taps) = (g.group_in(), g.group_out(), g.kernel[0] * g.kernel[1]);
     let mut out = Buffer::stale(w.len());
-    for (tap, block) in out.chunks_exact_mut((ng * g.channels).max(1)).enumerate() {
+    let work = w.len();
+    parallel::for_each_chunk(&mut out, ng * g.channels, work, |tap, block| {
         let from = &w[(taps - 1 - tap) * cg * g.out_channels..][..cg * g.out_channels];
-        for (j, row) in block.chunks_exact_mut(g.channels).enumerate() {
-            for (c, v) in row.iter_mut().enumerate() {
-                *v = from[(c % cg) * g.out_channels + (c / cg) * ng + j];
+        for group in 0..g.groups {
+            // Some channels at a time, which stay in the cache for all the outputs.
+            for first in (0..cg).step_by(TURNED) {
+                for (j, row) in block.chunks_exact_mut(g.channels).enumerate() {
+                    let row = &mut row[group * cg + first..(group + 1) * cg];
+                    let column = from[first * g.out_channels..][group * ng + j..].iter().step_by(g.out_channels);
+                    row.iter_mut().take(TURNED).zip(column).for_each(|(v, &w)| *v = w);
+                }
             }
         }
-    }
+    });
     out
 }
+
+/// Channels of a window turned at a time.
+const TURNED: usize = 16;
 
 /// dx from dy.
 pub(in crate::ops) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, dy: &[T], w: &[T]) {
