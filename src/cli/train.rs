@@ -18,7 +18,7 @@ use super::ablation;
 use super::progress::Progress;
 
 /// Steps of the default run.
-const STEPS: u64 = 3600;
+const STEPS: u64 = 3400;
 
 #[derive(clap::Args)]
 pub struct Args {
