@@ -7,7 +7,7 @@
 use std::collections::BTreeMap;
 
 use super::config::Config;
-use crate::nn::{Builder, Context, Conv, ConvStart, Init, Linear};
+use crate::nn::{Builder, Context, Conv, ConvStart, Init, Joined, Linear};
 use crate::ops::{Activation, Conv2d};
 use crate::tensor::{Float, Var};
 
@@ -94,24 +94,24 @@ impl Decoder {
         let mut nodes: BTreeMap<(usize, usize), Var<T>> = BTreeMap::new();
         nodes.insert((0, 0), features[0].clone());
         for (i, lateral) in self.lateral.iter().enumerate() {
-            nodes.insert((i + 1, 0), lateral.forward(c, &[&features[i + 1]]));
+            nodes.insert((i + 1, 0), lateral.forward(c, &Joined::from(&features[i + 1])));
         }
         for (i, j) in ORDER {
             let below = (i + 1, j - 1);
-            let high = self.up[&below].forward(c, &[&nodes[&below]]).upsample_nearest(2);
-            let mut parts = vec![&high];
-            parts.extend((0..j).map(|k| &nodes[&(i, k)]));
-            // Their concatenation is not made: what follows is a convolution, which reads them where they are.
+            let small = self.up[&below].forward(c, &Joined::from(&nodes[&below]));
+            let joined = Joined { small: Some(&small), parts: (0..j).map(|k| &nodes[&(i, k)]).collect() };
             let node = match (self.attention.get(&(i, j)), self.narrow.get(&(i, j))) {
-                (Some(attention), _) => attention.forward(c, &parts),
-                (None, Some(narrow)) => self.join[&below].forward(c, &[&narrow.forward_parts(c, &parts)]),
-                (None, None) => self.join[&below].forward(c, &parts),
+                (Some(attention), _) => attention.forward(c, &joined),
+                (None, Some(narrow)) => {
+                    self.join[&below].forward(c, &Joined::from(&narrow.forward_joined(c, &joined, None)))
+                }
+                (None, None) => self.join[&below].forward(c, &joined),
             };
             nodes.insert((i, j), node);
         }
         let last = &nodes[&(0, 4)];
-        let full = self.up[&(0, 4)].forward(c, &[last]).upsample_nearest(2);
-        let full = self.join[&(0, 4)].forward(c, &[&full]);
+        let small = self.up[&(0, 4)].forward(c, &Joined::from(last));
+        let full = self.join[&(0, 4)].forward(c, &Joined { small: Some(&small), parts: vec![] });
         let inputs = [&full, last, &nodes[&(1, 3)], &nodes[&(2, 2)]];
         self.heads.iter().zip(inputs).map(|(head, x)| head.forward(c, x).sigmoid()).collect()
     }
@@ -131,8 +131,8 @@ impl ConvBlock {
         ConvBlock(conv3x3(&mut b.at("conv"), channels).activated(Activation::Elu))
     }
 
-    fn forward<T: Float>(&self, c: &Context<T>, parts: &[&Var<T>]) -> Var<T> {
-        self.0.forward_parts(c, parts)
+    fn forward<T: Float>(&self, c: &Context<T>, joined: &Joined<T>) -> Var<T> {
+        self.0.forward_joined(c, joined, None)
     }
 }
 
@@ -153,28 +153,29 @@ impl AttentionConv {
         AttentionConv { attention, conv }
     }
 
-    fn forward<T: Float>(&self, c: &Context<T>, parts: &[&Var<T>]) -> Var<T> {
-        let Some(attention) = &self.attention else { return self.conv.forward_parts(c, parts) };
-        let gate = attention.gate(c, parts);
-        // Of one picture, the weights take the gate: there are fewer of them than pixels.
+    fn forward<T: Float>(&self, c: &Context<T>, joined: &Joined<T>) -> Var<T> {
+        let Some(attention) = &self.attention else { return self.conv.forward_joined(c, joined, None) };
+        let gate = attention.gate(c, joined);
         let b = gate.shape().dims()[0];
         if b == 1 {
-            return self.conv.forward_gated(c, parts, &gate);
+            return self.conv.forward_joined(c, joined, Some(&gate));
         }
+        // Pictures differ in their gates, and share the weights.
         let mut first = 0;
-        let gated = parts.iter().map(|&part| {
-            let channels = part.shape().last();
+        let gated = joined.images().map(|image| {
+            let channels = image.shape().last();
             let gate = gate.slice(1, first..first + channels).reshape([b, 1, 1, channels]);
             first += channels;
-            part * gate
+            image * gate
         });
         let gated: Vec<Var<T>> = gated.collect();
-        self.conv.forward_parts(c, &gated.iter().collect::<Vec<_>>())
+        let (small, parts) = gated.split_at(joined.small.is_some() as usize);
+        self.conv.forward_joined(c, &Joined { small: small.first(), parts: parts.iter().collect() }, None)
     }
 }
 
-/// The gate of channel attention (Hu et al., 1709.01507), by which an image z is multiplied, whose channels may come in
-/// parts: sigmoid(fc2(relu(fc0(mean of z over the image)))).
+/// The gate of channel attention (Hu et al., 1709.01507), by which an image z is multiplied, here of channels from several
+/// images: sigmoid(fc2(relu(fc0(mean of z over the image)))).
 #[derive(Clone, Debug)]
 struct ChannelAttention {
     squeeze: Linear,
@@ -190,8 +191,9 @@ impl ChannelAttention {
     }
 
     /// One factor for each channel, `[B, C]`.
-    fn gate<T: Float>(&self, c: &Context<T>, parts: &[&Var<T>]) -> Var<T> {
-        let means: Vec<Var<T>> = parts.iter().map(|part| part.mean(1, 2)).collect();
+    fn gate<T: Float>(&self, c: &Context<T>, joined: &Joined<T>) -> Var<T> {
+        // Enlarging an image leaves its mean as it is.
+        let means: Vec<Var<T>> = joined.images().map(|image| image.mean(1, 2)).collect();
         let mean = Var::concat(&means.iter().collect::<Vec<_>>(), 1);
         self.excite.forward(c, &self.squeeze.forward(c, &mean).relu()).sigmoid()
     }

@@ -12,6 +12,29 @@ pub struct Conv {
     op: Conv2d,
 }
 
+/// Images side by side along their channels, as a convolution reads them: nothing is concatenated, nothing enlarged.
+#[derive(Clone)]
+pub struct Joined<'a, T: Float> {
+    /// The first one at half the size of the others, `[B, H / 2, W / 2, ..]`, each of whose pixels stands for four; it
+    /// needs a window that keeps the size, 1x1 or 3x3 over mirrored padding.
+    pub small: Option<&'a Var<T>>,
+    /// The others, `[B, H, W, ..]`.
+    pub parts: Vec<&'a Var<T>>,
+}
+
+impl<'a, T: Float> Joined<'a, T> {
+    /// All of them.
+    pub fn images(&self) -> impl Iterator<Item = &'a Var<T>> {
+        self.small.into_iter().chain(self.parts.iter().copied())
+    }
+}
+
+impl<'a, T: Float> From<&'a Var<T>> for Joined<'a, T> {
+    fn from(x: &'a Var<T>) -> Self {
+        Joined { small: None, parts: vec![x] }
+    }
+}
+
 /// How a convolution starts, and whether it has a bias.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ConvStart {
@@ -54,12 +77,17 @@ impl Conv {
         Var::conv2d_of_parts(parts, c.var(self.weight), self.bias.map(|b| c.var(b)), self.op)
     }
 
-    /// The same of the images times one gate for each channel, `[in]`: the weights take the gate, since there are fewer
-    /// of them than pixels.
+    /// The same of images `joined`, times one gate `[in]` for each of their channels, if there is one: the weights take
+    /// the gate, since there are fewer of them than pixels.
     #[track_caller]
-    pub fn forward_gated<T: Float>(&self, c: &Context<T>, parts: &[&Var<T>], gate: &Var<T>) -> Var<T> {
-        let weight = c.var(self.weight) * gate.reshape([1, 1, gate.shape().len(), 1]);
-        Var::conv2d_of_parts(parts, &weight, self.bias.map(|b| c.var(b)), self.op)
+    pub fn forward_joined<T: Float>(&self, c: &Context<T>, joined: &Joined<T>, gate: Option<&Var<T>>) -> Var<T> {
+        let (weight, bias) = (c.var(self.weight), self.bias.map(|b| c.var(b)));
+        let gated = gate.map(|gate| weight * gate.reshape([1, 1, gate.shape().len(), 1]));
+        let weight = gated.as_ref().unwrap_or(weight);
+        match joined.small {
+            Some(small) => Var::conv2d_of_upsampled(small, &joined.parts, weight, bias, self.op),
+            None => Var::conv2d_of_parts(&joined.parts, weight, bias, self.op),
+        }
     }
 
     /// The same convolution with an activation behind it.

@@ -21,7 +21,7 @@ mod stored;
 mod tensor_file;
 
 pub use context::Context;
-pub use conv::{Conv, ConvBn, ConvStart, DepthwiseConv, Normalised};
+pub use conv::{Conv, ConvBn, ConvStart, DepthwiseConv, Joined, Normalised};
 pub use fit::{Fit, Mismatch, Named, Report, Skipped, fit};
 pub use fold::Folded;
 pub use init::{Init, Start};

@@ -1,6 +1,6 @@
 //! Transposed 2-D convolution: the gradient of a convolution as a forward pass, which spreads every pixel over a window.
 
-use super::conv2d::geometry::Geometry;
+use super::conv2d::geometry::{Beyond, Geometry};
 use super::conv2d::kernel;
 use super::conv2d::parts::whole;
 use super::fused::Finish;
@@ -89,7 +89,7 @@ impl ConvTranspose2d {
             padding: self.padding,
             dilation: self.dilation,
             groups: self.groups,
-            reflect: false,
+            beyond: Beyond::Zero,
             tile: self.tile,
         })
     }

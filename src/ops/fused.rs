@@ -35,6 +35,16 @@ impl Activation {
         }
     }
 
+    /// A kernel path's name, of those that [`paths`] makes.
+    pub(super) fn among(self, [plain, relu, hardswish, elu]: [&'static str; 4]) -> &'static str {
+        match self {
+            Activation::None => plain,
+            Activation::Relu => relu,
+            Activation::Hardswish => hardswish,
+            Activation::Elu => elu,
+        }
+    }
+
     /// Whether the derivative follows from the result alone, so that the argument need not be kept.
     pub(super) fn follows_from_result(self) -> bool {
         self != Activation::Hardswish
@@ -64,6 +74,14 @@ impl Activation {
         dy
     }
 }
+
+/// A kernel path's names, by the activation behind it: for [`Activation::among`].
+macro_rules! paths {
+    ($path:literal) => {
+        [$path, concat!($path, "_relu"), concat!($path, "_hardswish"), concat!($path, "_elu")]
+    };
+}
+pub(super) use paths;
 
 /// Elements handed to a thread at a time.
 const CHUNK: usize = 1 << 14;

@@ -33,7 +33,7 @@ pub(super) fn forward<T: Float>(out: &mut [T], parts: &[Rows<T>], w: &[T], finis
     parallel::for_each_chunk(out, tile * n, work, |i, out| {
         let rows = out.len() / n;
         let lines: Vec<Line<T>> = parts.iter().map(|x| line(x.rows(i * tile, rows))).collect();
-        Product { out, accum: Accum::Replace, lines: &lines, panels: &panels }.run();
+        Product { out, out_step: n, accum: Accum::Replace, lines: &lines, panels: &panels }.run();
         finish.run(out);
     });
 }
@@ -108,7 +108,7 @@ pub(crate) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, dy: Rows<T>,
 
 /// `out = x panels`, or added to what is there.
 fn product<T: Float>(out: &mut [T], accum: Accum, x: Rows<T>, panels: &Panels<T>) {
-    Product { out, accum, lines: &[line(x)], panels }.run();
+    Product { out, out_step: panels.cols(), accum, lines: &[line(x)], panels }.run();
 }
 
 /// Rows as the left operand of a product.

@@ -58,6 +58,7 @@ pub mod ssim;
 pub mod top_k;
 pub mod unary;
 pub mod upsample_nearest;
+pub mod upsampled_conv2d;
 pub mod variance;
 pub mod warp;
 

@@ -58,6 +58,7 @@ registry! {
     "reflect_pad" => reflect_pad::ReflectPad,
     "slice" => slice::Slice,
     "upsample_nearest" => upsample_nearest::UpsampleNearest,
+    "upsampled_conv2d" => upsampled_conv2d::UpsampledConv2d,
     "batch_norm" => batch_norm::BatchNorm,
     "batch_norm_eval" => batch_norm::BatchNormEval,
     "layer_norm" => layer_norm::LayerNorm,

@@ -63,38 +63,39 @@ impl<T: Float> Op<T> for UpsampleNearest {
 
     /// A pixel's gradient is the sum of those of its square.
     fn backward(&self, shape: Shape, upstream: Upstream<T>, sink: &mut GradSink<T>) {
-        let (g, s) = (upstream.only(), self.scale);
-        let [_, _, w, c] = shape.nhwc().expect("checked by the shape rule");
-        sink.accumulate(0, |out, accum| {
-            let work = g.len();
-            let row = w * s * c;
-            if work == 0 {
-                return;
-            }
-            parallel::for_each_chunk(out, w * c, work, |i, out| {
-                let g = &g.data()[i * s * row..][..s * row];
-                simd::dispatch(
-                    #[inline(always)]
-                    || {
-                        if s == 2 {
-                            let (top, bottom) = g.split_at(row);
-                            return sum_pairs(out, accum, top, bottom, c);
-                        }
-                        if accum == Accum::Replace {
-                            out.fill(T::ZERO);
-                        }
-                        for g in g.chunks_exact(row) {
-                            for (d, g) in out.chunks_exact_mut(c).zip(g.chunks_exact(s * c)) {
-                                for g in g.chunks_exact(c) {
-                                    d.iter_mut().zip(g).for_each(|(d, &g)| *d += g);
-                                }
-                            }
-                        }
-                    },
-                );
-            });
-        });
+        let (g, [_, _, w, c]) = (upstream.only(), shape.nhwc().expect("checked by the shape rule"));
+        sink.accumulate(0, |out, accum| sum_squares(out, accum, g.data(), [w, c], self.scale));
     }
+}
+
+/// The sum of each square of `s` x `s` pixels of g, for an image of `w` squares a row with `c` channels.
+pub(super) fn sum_squares<T: Float>(out: &mut [T], accum: Accum, g: &[T], [w, c]: [usize; 2], s: usize) {
+    let row = w * s * c;
+    if g.is_empty() {
+        return;
+    }
+    parallel::for_each_chunk(out, w * c, g.len(), |i, out| {
+        let g = &g[i * s * row..][..s * row];
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                if s == 2 {
+                    let (top, bottom) = g.split_at(row);
+                    return sum_pairs(out, accum, top, bottom, c);
+                }
+                if accum == Accum::Replace {
+                    out.fill(T::ZERO);
+                }
+                for g in g.chunks_exact(row) {
+                    for (d, g) in out.chunks_exact_mut(c).zip(g.chunks_exact(s * c)) {
+                        for g in g.chunks_exact(c) {
+                            d.iter_mut().zip(g).for_each(|(d, &g)| *d += g);
+                        }
+                    }
+                }
+            },
+        );
+    });
 }
 
 /// The sum of each square of 2 x 2 pixels of two rows.

@@ -47,6 +47,11 @@ impl<T: Float> Panels<T> {
         })
     }
 
+    /// Columns of the matrix.
+    pub(crate) fn cols(&self) -> usize {
+        self.cols
+    }
+
     /// `fill(first, width, step, panel)` writes `width` columns from `first` on into rows of `step` numbers.
     #[inline(always)]
     fn pack(rows: usize, cols: usize, fill: impl Fn(usize, usize, usize, &mut [T]) + Sync + Send) -> Self {
@@ -83,9 +88,10 @@ pub(crate) struct Line<'a, T> {
 
 /// `out = A B`, or added to what is there: the columns of A are those of the lines, one line after the other.
 ///
-/// `out` has rows of as many numbers as B has columns.
+/// `out` has rows of as many numbers as B has columns, `out_step` apart.
 pub(crate) struct Product<'a, T: Float> {
     pub(crate) out: &'a mut [T],
+    pub(crate) out_step: usize,
     pub(crate) accum: Accum,
     pub(crate) lines: &'a [Line<'a, T>],
     pub(crate) panels: &'a Panels<T>,
@@ -105,7 +111,7 @@ impl<T: Float> Product<'_, T> {
         }
         if rows == 0 {
             if self.accum == Accum::Replace {
-                self.out.fill(T::ZERO);
+                self.out.chunks_mut(self.out_step).for_each(|row| row[..cols].fill(T::ZERO));
             }
             return;
         }
@@ -114,8 +120,8 @@ impl<T: Float> Product<'_, T> {
 
     #[inline(always)]
     fn panel<S: Simd, const P: usize, const N: usize>(&mut self, simd: S, first: usize) {
-        let cols = self.panels.cols;
-        let rows = self.out.len() / cols;
+        // What lies behind the last row's numbers may be missing.
+        let rows = (self.out.len() + self.out_step - self.panels.cols) / self.out_step;
         let panel = &self.panels.data[first * self.panels.rows..][..self.panels.rows * N * T::lanes::<S>()];
         let mut at = 0;
         while at + P <= rows {
@@ -176,8 +182,8 @@ impl<T: Float> Product<'_, T> {
         accum: Accum,
     ) {
         let (lanes, cols) = (T::lanes::<S>(), self.panels.cols);
-        let out = self.out[at * cols..(at + P) * cols].chunks_exact_mut(cols);
-        for (out, sums) in out.zip(sums) {
+        for (p, sums) in sums.iter().enumerate() {
+            let out = &mut self.out[(at + p) * self.out_step..][..cols];
             for (q, &sum) in sums.iter().enumerate() {
                 settle(simd, &mut out[first + q * lanes..], sum, accum);
             }
@@ -351,7 +357,7 @@ mod tests {
             };
             for (accum, start) in [(Accum::Replace, 0.0), (Accum::Add, 0.5)] {
                 let mut out = vec![if accum == Accum::Add { start } else { f64::NAN }; rows * cols];
-                Product { out: &mut out, accum, lines: &lines, panels: &panels }.run();
+                Product { out: &mut out, out_step: cols, accum, lines: &lines, panels: &panels }.run();
                 for (i, &found) in out.iter().enumerate() {
                     let expected = start + expected(i / cols, i % cols);
                     assert!((found - expected).abs() < 1e-12, "{rows}x{cols}, {i}: {found} for {expected}");
@@ -370,12 +376,31 @@ mod tests {
         let b = numbers(274 * cols);
         let panels = Panels::dense(&b, 274, cols);
         let mut out = vec![f64::NAN; rows * cols];
-        Product { out: &mut out, accum: Accum::Replace, lines: &lines, panels: &panels }.run();
+        Product { out: &mut out, out_step: cols, accum: Accum::Replace, lines: &lines, panels: &panels }.run();
         for (i, &found) in out.iter().enumerate() {
             let (p, n) = (i / cols, i % cols);
             let row = (0..runs.len()).flat_map(|l| &data[l][p * steps[l]..][..runs[l]]);
             let expected: f64 = row.enumerate().map(|(k, a)| a * b[k * cols + n]).sum();
             assert!((found - expected).abs() < 1e-12, "{i}: {found} for {expected}");
+        }
+    }
+
+    #[test]
+    fn rows_of_a_product_may_stand_apart() {
+        let (rows, cols, run, step) = (14, 5, 3, 12);
+        let (a, b) = (numbers(rows * run), numbers(run * cols));
+        let panels = Panels::dense(&b, run, cols);
+        let lines = [Line { data: &a, step: run, run }];
+        // With and without what is missing behind the last row's numbers.
+        for len in [rows * step, (rows - 1) * step + cols] {
+            let mut out = vec![7.0; len];
+            Product { out: &mut out, out_step: step, accum: Accum::Replace, lines: &lines, panels: &panels }.run();
+            for (i, &found) in out.iter().enumerate() {
+                let (p, n) = (i / step, i % step);
+                let product = || (0..run).map(|k| a[p * run + k] * b[k * cols + n]).sum();
+                let expected: f64 = if n < cols { product() } else { 7.0 };
+                assert!((found - expected).abs() < 1e-12, "{i}: {found} for {expected}");
+            }
         }
     }
 

@@ -14,7 +14,7 @@ use crate::tensor::register_tile::{Gram, Line, Panels, Product};
 use crate::tensor::{Accum, Float, parallel, simd};
 
 /// The rows of one image that some rows of the output see, with their padding.
-struct Band<T: Float> {
+pub(in crate::ops) struct Band<T: Float> {
     data: Buffer<T>,
     /// Numbers in a padded row.
     line: usize,
@@ -53,13 +53,13 @@ impl<T: Float> Band<T> {
     }
 
     /// The row under row `ky` of the windows of the band's output row `r`.
-    fn line(&self, g: &Geometry, r: usize, ky: usize) -> &[T] {
+    pub(in crate::ops) fn line(&self, g: &Geometry, r: usize, ky: usize) -> &[T] {
         &self.data[(r * g.stride[0] + ky * g.dilation[0]) * self.line..][..self.line]
     }
 }
 
 /// Calls `f(band, image, output rows in the image)` for output rows of the whole batch, image by image.
-fn for_each_band<T: Float>(
+pub(in crate::ops) fn for_each_band<T: Float>(
     g: &Geometry,
     x: &[Part<T>],
     rows: Range<usize>,
@@ -97,7 +97,7 @@ pub(super) fn convolve<T: Float>(
                 let lines: Vec<Line<T>> = lines.collect();
                 let (out, others) = std::mem::take(&mut rest).split_at_mut(width * n);
                 rest = others;
-                Product { out, accum, lines: &lines, panels: &panels }.run();
+                Product { out, out_step: n, accum, lines: &lines, panels: &panels }.run();
             }
         });
         finish.run(out);

@@ -4,6 +4,17 @@ use super::Conv2d;
 use crate::ops::ShapeError;
 use crate::tensor::Shape;
 
+/// What a window sees beyond the edge of the image.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Beyond {
+    /// Zeros.
+    Zero,
+    /// The image mirrored, without repeating its edge.
+    Mirrored,
+    /// The pixel at the edge, again and again.
+    Nearest,
+}
+
 /// Everything about a convolution but its numbers. Pairs are (height, width).
 #[derive(Clone, Copy, Debug)]
 pub struct Geometry {
@@ -17,7 +28,7 @@ pub struct Geometry {
     pub(in crate::ops) padding: [usize; 2],
     pub(in crate::ops) dilation: [usize; 2],
     pub(in crate::ops) groups: usize,
-    pub(in crate::ops) reflect: bool,
+    pub(in crate::ops) beyond: Beyond,
     pub(in crate::ops) tile: usize,
 }
 
@@ -57,7 +68,7 @@ impl Geometry {
             padding: op.padding,
             dilation: op.dilation,
             groups: op.groups,
-            reflect: op.reflect,
+            beyond: if op.reflect { Beyond::Mirrored } else { Beyond::Zero },
             tile: op.tile,
         })
     }
@@ -70,15 +81,16 @@ impl Geometry {
 
     /// The input row or column at a position of the padded image; `None` in zero padding.
     #[inline(always)]
-    pub(super) fn padded(&self, d: usize, at: usize) -> Option<usize> {
+    pub(in crate::ops) fn padded(&self, d: usize, at: usize) -> Option<usize> {
         let i = at as isize - self.padding[d] as isize;
         let n = self.size[d] as isize;
         if (0..n).contains(&i) {
-            Some(i as usize)
-        } else if self.reflect {
-            Some(if i < 0 { -i } else { 2 * (n - 1) - i } as usize)
-        } else {
-            None
+            return Some(i as usize);
+        }
+        match self.beyond {
+            Beyond::Zero => None,
+            Beyond::Mirrored => Some(if i < 0 { -i } else { 2 * (n - 1) - i } as usize),
+            Beyond::Nearest => Some(i.clamp(0, n - 1) as usize),
         }
     }
 
@@ -101,12 +113,12 @@ impl Geometry {
     }
 
     /// Numbers in one patch of one group: the columns of the im2col matrix.
-    pub(super) fn patch(&self) -> usize {
+    pub(in crate::ops) fn patch(&self) -> usize {
         self.kernel[0] * self.kernel[1] * self.group_in()
     }
 
     /// Rows of output pixels, over the whole batch.
-    pub(super) fn rows(&self) -> usize {
+    pub(in crate::ops) fn rows(&self) -> usize {
         self.batch * self.out[0]
     }
 
@@ -117,7 +129,7 @@ impl Geometry {
 
     /// Output rows a tile, at least four tiles where there are four rows: an im2col matrix of some 256 KiB; or half of
     /// that in rows of the image, or of the output.
-    pub(super) fn tile(&self) -> usize {
+    pub(in crate::ops) fn tile(&self) -> usize {
         if self.tile > 0 {
             return self.tile;
         }
@@ -175,7 +187,7 @@ impl Geometry {
             out: self.size,
             out_channels: self.channels,
             padding,
-            reflect: false,
+            beyond: Beyond::Zero,
             ..*self
         })
     }

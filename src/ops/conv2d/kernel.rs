@@ -1,7 +1,7 @@
 //! The three products of a convolution, tile by tile: outputs, the gradient of the input, the gradient of the weights.
 
 use super::direct;
-use super::geometry::Geometry;
+use super::geometry::{Beyond, Geometry};
 use super::parts::{Part, in_one_piece, whole};
 use crate::ops::fused::Finish;
 use crate::ops::linear::sum_into;
@@ -141,21 +141,22 @@ pub(in crate::ops) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, g: &
         Some(t) => {
             let turned = turned(g, w);
             convolve(out, accum, &t, &whole(&t, dy), &turned, &Finish::nothing());
-            if g.reflect {
-                mirrored_border(out, g, &t, dy, &turned);
+            if g.beyond != Beyond::Zero {
+                border_gradient(out, g, &t, dy, &turned);
             }
         }
         None => scatter(out, accum, g, dy, w),
     }
 }
 
-/// What the mirrored padding adds to dx: the gradient at every padded position goes to the pixel mirrored there.
-fn mirrored_border<T: Float>(out: &mut [T], g: &Geometry, t: &Geometry, dy: &[T], turned: &[T]) {
+/// What the padding adds to dx: the gradient at every padded position goes to the pixel that is seen there. dx is the
+/// convolution `t` of dy with the weights `turned`.
+pub(in crate::ops) fn border_gradient<T: Float>(out: &mut [T], g: &Geometry, t: &Geometry, dy: &[T], turned: &[T]) {
     // The same convolution of dy over the padded extent; of its rows and columns only the border is computed.
     let [ph, pw] = g.padding;
     let padded = Geometry {
         out: [g.size[0] + 2 * ph, g.size[1] + 2 * pw],
-        padding: [t.padding[0] + ph, t.padding[1] + pw],
+        padding: [t.padding[0] + ph * t.stride[0], t.padding[1] + pw * t.stride[1]],
         ..*t
     };
     let is_border = |y: usize, x: usize| y < ph || y >= ph + g.size[0] || x < pw || x >= pw + g.size[1];
@@ -163,17 +164,7 @@ fn mirrored_border<T: Float>(out: &mut [T], g: &Geometry, t: &Geometry, dy: &[T]
         .flat_map(|y| (0..padded.out[1]).map(move |x| (y, x)))
         .filter(|&(y, x)| is_border(y, x))
         .collect();
-    let mirror = |i: usize, p: usize, n: usize| {
-        let i = i as isize - p as isize;
-        (if i < 0 {
-            -i
-        } else if i >= n as isize {
-            2 * (n as isize - 1) - i
-        } else {
-            i
-        }) as usize
-    };
-    let (patch, c, image) = (padded.patch(), g.channels, g.out[0] * g.out[1] * g.out_channels);
+    let (patch, c, image) = (padded.patch(), g.channels, t.size[0] * t.size[1] * t.channels);
     let work = 2 * g.batch * positions.len() * patch * c;
     parallel::for_each_chunk(out, g.size[0] * g.size[1] * c, work, |b, out| {
         let mut patches = Buffer::stale(positions.len() * patch);
@@ -188,7 +179,8 @@ fn mirrored_border<T: Float>(out: &mut [T], g: &Geometry, t: &Geometry, dy: &[T]
             gemm(RowsMut::columns(&mut sums, positions.len(), c, first, cg), Accum::Replace, patches, weights, T::ONE);
         }
         for (&(y, x), sum) in positions.iter().zip(sums.chunks_exact(c)) {
-            let to = (mirror(y, ph, g.size[0]) * g.size[1] + mirror(x, pw, g.size[1])) * c;
+            let (Some(y), Some(x)) = (g.padded(0, y), g.padded(1, x)) else { continue };
+            let to = (y * g.size[1] + x) * c;
             out[to..to + c].iter_mut().zip(sum).for_each(|(d, &s)| *d += s);
         }
     });
@@ -208,7 +200,7 @@ fn gather_patch<T: Float>(g: &Geometry, image: &[T], oy: usize, ox: usize, group
 }
 
 /// The weights that see some of the channels, from `first` on as many as `g` has: `[kh, kw, channels, out]`.
-pub(super) fn weights_of<T: Float>(g: &Geometry, first: usize, channels: usize, w: &[T]) -> Buffer<T> {
+pub(in crate::ops) fn weights_of<T: Float>(g: &Geometry, first: usize, channels: usize, w: &[T]) -> Buffer<T> {
     let mut out = Buffer::stale(g.kernel[0] * g.kernel[1] * g.channels * g.out_channels);
     let taps = w.chunks_exact((channels * g.out_channels).max(1));
     for (out, w) in out.chunks_exact_mut((g.channels * g.out_channels).max(1)).zip(taps) {
@@ -301,4 +293,4 @@ fn add_weight_gradient<T: Float>(sum: &mut [T], g: &Geometry, x: &[T], dy: &[T],
 }
 
 /// Partial sums of a weight gradient.
-const PARTS: usize = 4;
+pub(in crate::ops) const PARTS: usize = 4;

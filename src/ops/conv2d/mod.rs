@@ -5,12 +5,12 @@
 //! whose windows are not whole runs, are copied into an im2col matrix in tiles that fit the cache (`kernel`). Reflection
 //! padding is a matter of what is copied, and costs nothing.
 
-mod direct;
+pub(super) mod direct;
 pub(super) mod geometry;
 pub(super) mod kernel;
 pub(super) mod parts;
 
-use super::fused::{Activation, Finish};
+use super::fused::{Activation, Finish, paths};
 use super::linear;
 use super::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::gemm::Rows;
@@ -111,13 +111,6 @@ impl Conv2d {
     }
 }
 
-/// A kernel path's names, by the activation behind it.
-macro_rules! paths {
-    ($path:literal) => {
-        [$path, concat!($path, "_relu"), concat!($path, "_hardswish"), concat!($path, "_elu")]
-    };
-}
-
 impl<T: Float> Op<T> for Conv2d {
     type Saved = Saved<T>;
 
@@ -131,7 +124,7 @@ impl<T: Float> Op<T> for Conv2d {
 
     fn algo(&self, inputs: &[Shape]) -> &'static str {
         let Ok(g) = self.geometry(inputs) else { return "none" };
-        let [plain, relu, hardswish, elu] = match g.side_by_side() {
+        let names = match g.side_by_side() {
             _ if self.parts > 1 && self.is_pointwise(g.kernel) => paths!("parts_pointwise"),
             _ if self.parts > 1 && !g.is_direct() => paths!("parts_im2col"),
             1 if self.parts > 1 => paths!("parts_direct"),
@@ -145,12 +138,7 @@ impl<T: Float> Op<T> for Conv2d {
             _ if self.stride != [1; 2] => paths!("side_by_side_strided"),
             _ => paths!("side_by_side"),
         };
-        match self.activation {
-            Activation::None => plain,
-            Activation::Relu => relu,
-            Activation::Hardswish => hardswish,
-            Activation::Elu => elu,
-        }
+        self.activation.among(names)
     }
 
     fn flops(&self, inputs: &[Shape]) -> u64 {
@@ -245,11 +233,11 @@ pub struct Saved<T: Float> {
 }
 
 /// Pixels as rows of channels.
-fn rows_of<T: Float>(x: &Tensor<T>) -> Rows<'_, T> {
+pub(super) fn rows_of<T: Float>(x: &Tensor<T>) -> Rows<'_, T> {
     Rows::dense(x.data(), x.shape().rows(), x.shape().last())
 }
 
-fn parts_of<'a, T: Float>(xs: impl IntoIterator<Item = &'a Tensor<T>>) -> Vec<Part<'a, T>> {
+pub(super) fn parts_of<'a, T: Float>(xs: impl IntoIterator<Item = &'a Tensor<T>>) -> Vec<Part<'a, T>> {
     xs.into_iter().map(|x| Part { data: x.data(), channels: x.shape().last() }).collect()
 }
 
