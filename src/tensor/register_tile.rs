@@ -182,8 +182,9 @@ impl<T: Float> Product<'_, T> {
         accum: Accum,
     ) {
         let (lanes, cols) = (T::lanes::<S>(), self.panels.cols);
-        for (p, sums) in sums.iter().enumerate() {
-            let out = &mut self.out[(at + p) * self.out_step..][..cols];
+        let out = self.out[at * self.out_step..].chunks_mut(self.out_step);
+        for (out, sums) in out.zip(sums) {
+            let out = &mut out[..cols];
             for (q, &sum) in sums.iter().enumerate() {
                 settle(simd, &mut out[first + q * lanes..], sum, accum);
             }

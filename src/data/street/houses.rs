@@ -40,7 +40,7 @@ pub(crate) fn row(world: &mut World, draw: &mut Draw, style: &Style, side: f64) 
         z += width;
         if open || !draw.chance(closed) {
             let gap = if open { draw.range(6.0, 35.0) } else { draw.range(1.0, 7.0) };
-            let behind = if open { draw.range(14.0, 45.0) } else { 14.0 };
+            let behind = if open { draw.range(14.0, 28.0) } else { 14.0 };
             fill(world, draw, style, [side, front, behind], z, gap);
             z += gap;
         }
@@ -161,7 +161,7 @@ fn fill(world: &mut World, draw: &mut Draw, style: &Style, [side, front, behind]
         };
         world.add(draw, shape, material, [low, GROUND_Y, z]);
     }
-    if gap > 2.5 && draw.chance(0.3) {
+    if gap > 2.5 && draw.chance(0.2) {
         let x = side * (front + draw.range(2.5, 5.0));
         props::tree(world, draw, style, x, z + 0.5 * gap, 1.3);
     }

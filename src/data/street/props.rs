@@ -59,7 +59,7 @@ pub(crate) fn traffic(world: &mut World, draw: &mut Draw, frames: usize) {
 
 /// A car around `x` from `z` on, seen from behind if `away`; gives its length.
 fn car(world: &mut World, draw: &mut Draw, x: f64, z: f64, away: bool, speed: f64) -> f64 {
-    let van = draw.chance(0.4);
+    let van = draw.chance(0.5);
     let length = if van { draw.range(4.6, 6.0) } else { draw.range(3.6, 4.8) };
     let height = if van { draw.range(1.75, 2.4) } else { draw.range(1.4, 1.65) };
     let half = 0.5 * draw.range(1.68, 2.0 * HALF_CAR);
@@ -123,7 +123,7 @@ pub(crate) fn poles(world: &mut World, draw: &mut Draw, style: &Style, side: f64
     while z < style.end {
         let x = side * draw.range(style.half + 0.15, style.half + 0.9);
         let origin = [x, GROUND_Y, z];
-        match draw.pick(&[0, 0, 1, 1, 2]) {
+        match draw.pick(&[0, 0, 0, 1, 2, 2]) {
             0 => {
                 let metal = vary(draw, [0.34, 0.36, 0.36], 0.02, 0.12);
                 let radius = draw.range(0.08, 0.12);
@@ -156,7 +156,7 @@ pub(crate) fn poles(world: &mut World, draw: &mut Draw, style: &Style, side: f64
                 world.add(draw, shape, Material::Sign(colour), origin);
             }
         }
-        z += draw.range(9.0, 22.0);
+        z += draw.range(10.0, 26.0);
     }
 }
 

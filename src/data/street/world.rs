@@ -67,15 +67,15 @@ impl World {
         // Lanes, streets and avenues; traffic needs a street.
         let half = match draw.pick(&[0, 1, 1, 1, 2]) {
             0 if !moving_cars => draw.range(4.0, 4.7),
-            2 if !moving_cars => draw.range(6.0, 8.5),
+            2 if !moving_cars => draw.range(5.8, 7.4),
             _ => draw.range(5.15, 5.45),
         };
-        let mut garden = || if draw.chance(0.4) { draw.range(2.0, 12.0) } else { 0.0 };
+        let mut garden = || if draw.chance(0.3) { draw.range(2.0, 9.0) } else { 0.0 };
         let setback = [garden(), garden()];
         let style = Style {
             half,
             setback,
-            open: [draw.chance(0.2), draw.chance(0.2)],
+            open: [draw.chance(0.15), draw.chance(0.15)],
             begin: -12.0,
             end: travel + FAR as f64,
             car_gap: [draw.pick(&CAR_GAPS), draw.pick(&CAR_GAPS)],
@@ -185,7 +185,7 @@ impl World {
 /// From a parked car's side to the camera: half a car of its own, and what a careful driver leaves.
 const CLEARANCE: f64 = 1.45;
 /// From bumper to bumper, to hardly a car.
-const CAR_GAPS: [f64; 6] = [3.0, 5.0, 8.0, 12.0, 16.0, 40.0];
+const CAR_GAPS: [f64; 6] = [3.0, 4.0, 7.0, 10.0, 14.0, 30.0];
 /// Leaves and paving, before they vary.
 const GREEN: [f64; 3] = [0.27, 0.37, 0.17];
 const STONE: [f64; 3] = [0.56, 0.54, 0.51];

@@ -18,6 +18,7 @@ use parallax::ops::shape_ops::Permute;
 use parallax::ops::slice::Slice;
 use parallax::ops::softmax::Softmax;
 use parallax::ops::unary::Unary;
+use parallax::ops::upsampled_conv2d::UpsampledConv2d;
 use parallax::ops::variance::Variance;
 use parallax::ops::{Conv2d, apply};
 use parallax::tensor::{Shape, Tensor, Var, parallel};
@@ -198,6 +199,17 @@ pub static ALL: &[Mutant] = &[
         let channels = inputs[1].shape().last();
         inputs[1] = turned(&inputs[1], channels);
         keep(b, 0, b.at(&inputs, &b.upstream))
+    }),
+    bug("border", "upsampled_conv2d", "as if zeros lay beyond the edge", |b| {
+        let UpsampledConv2d { parts, activation, .. } = *b.op::<UpsampledConv2d>();
+        if b.x(parts + 1).dims()[0] == 1 {
+            return b.right();
+        }
+        b.of(b.inputs, &b.upstream, |v| {
+            let large = v[0].upsample_nearest(2);
+            let inputs: Vec<_> = [&large].into_iter().chain(v[1..].iter().copied()).collect();
+            apply(Conv2d { parts: parts + 1, activation, ..Conv2d::padded(1) }, &inputs)
+        })
     }),
     bug("border", "slice", "one element spread over the span", |b| {
         let Slice { axis, start, end, .. } = *b.op::<Slice>();
