@@ -161,9 +161,9 @@ pub fn run(args: Args) -> Result<()> {
         return super::print_json(&written);
     }
     if written.maps.is_empty() {
-        println!("these networks have no transformer paths: the disparities and the saliency are all there is to see");
+        say!("these networks have no transformer paths: the disparities and the saliency are all there is to see");
     }
-    println!("{} is the sheet; {} more pictures beside it", written.sheet.display(), written.maps.len() + 1);
+    say!("{} is the sheet; {} more pictures beside it", written.sheet.display(), written.maps.len() + 1);
     Ok(())
 }
 

@@ -48,9 +48,9 @@ pub fn run(args: Args) -> Result<()> {
     if args.json {
         return super::print_json(&weights.report);
     }
-    println!("{}", weights.report);
+    say!("{}", weights.report);
     for output in outputs {
-        println!("wrote       {}", output.display());
+        say!("wrote       {}", output.display());
     }
     Ok(())
 }

@@ -64,7 +64,7 @@ pub fn run(args: Args) -> Result<()> {
         return super::print_json(&report);
     }
     let m = report.metrics;
-    println!("images    {}", report.images);
+    say!("images    {}", report.images);
     for (name, value) in [
         ("Abs Rel", m.abs_rel),
         ("Sq Rel", m.sq_rel),
@@ -74,10 +74,10 @@ pub fn run(args: Args) -> Result<()> {
         ("a2", m.a2),
         ("a3", m.a3),
     ] {
-        println!("{name:9} {value:.4}");
+        say!("{name:9} {value:.4}");
     }
     if let (Some(ratio), Some(std)) = (report.ratio_median, report.ratio_std) {
-        println!("scale     median ratio {ratio:.3}, deviation {std:.3}");
+        say!("scale     median ratio {ratio:.3}, deviation {std:.3}");
     }
     Ok(())
 }

@@ -79,17 +79,29 @@ pub fn run(args: Args) -> Result<()> {
     if args.json {
         super::print_json(&table)?;
     } else {
-        println!(
+        say!(
             "{:24} {:16} {:>5} {:>8} {:>5} {:>9} {:>8}",
-            "op", "kernel path", "cases", "elements", "kinks", "max error", "ms"
+            "op",
+            "kernel path",
+            "cases",
+            "elements",
+            "kinks",
+            "max error",
+            "ms"
         );
         for r in &table.ops {
-            println!(
+            say!(
                 "{:24} {:16} {:5} {:8} {:5} {:9.1e} {:8.1}",
-                r.op, r.algo, r.cases, r.elements, r.kinks, r.max_error, r.milliseconds
+                r.op,
+                r.algo,
+                r.cases,
+                r.elements,
+                r.kinks,
+                r.max_error,
+                r.milliseconds
             );
         }
-        println!("{} ops and kernel paths, {} failed", table.ops.len(), table.failed);
+        say!("{} ops and kernel paths, {} failed", table.ops.len(), table.failed);
     }
     match table.failed {
         0 => Ok(()),

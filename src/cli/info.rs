@@ -65,13 +65,13 @@ pub fn run(args: Args) -> Result<()> {
         return super::print_json(&info);
     }
     let p = &info.parameters;
-    println!("{} at {}x{}, batch {}", args.preset.name(), args.width, args.height, args.batch);
+    say!("{} at {}x{}, batch {}", args.preset.name(), args.width, args.height, args.batch);
     for (name, n) in [("encoder", p.encoder), ("depth", p.depth), ("pose encoder", p.pose_encoder), ("pose", p.pose)] {
-        println!("{name:14} {n:>12} parameters");
+        say!("{name:14} {n:>12} parameters");
     }
-    println!("{:14} {learnt:>12} parameters", "together");
-    println!("{:14} {:>12.2} GFLOP", "inference", info.gflop_inference);
-    println!("{:14} {:>12.2} GFLOP", "training step", info.gflop_step);
-    println!("{:14} {:>12.0} MiB (estimate)", "training step", info.memory_bytes as f64 / f64::from(1 << 20));
+    say!("{:14} {learnt:>12} parameters", "together");
+    say!("{:14} {:>12.2} GFLOP", "inference", info.gflop_inference);
+    say!("{:14} {:>12.2} GFLOP", "training step", info.gflop_step);
+    say!("{:14} {:>12.0} MiB (estimate)", "training step", info.memory_bytes as f64 / f64::from(1 << 20));
     Ok(())
 }

@@ -1,5 +1,10 @@
 //! The command line: arguments in, library calls, tables and JSON out. Exit status 0 done, 1 failed, 2 wrong usage.
 
+/// A line on standard output: `println!` for which a reader that has seen enough (`| head`) is no failure.
+macro_rules! say {
+    ($($text:tt)*) => { crate::cli::say(format_args!($($text)*)) };
+}
+
 mod ablation;
 mod attention;
 mod bench;
@@ -91,6 +96,18 @@ fn start_threads(threads: Option<u16>) -> Result<()> {
 /// Prints a value as one line of JSON on standard output.
 fn print_json(value: &impl serde::Serialize) -> Result<()> {
     let text = serde_json::to_string(value).map_err(|e| Error::Failed(format!("the result as JSON: {e}")))?;
-    println!("{text}");
+    say!("{text}");
     Ok(())
+}
+
+/// Writes a line for `say!`. Nobody reads on when this ends the program, and all that was made is already written.
+fn say(text: std::fmt::Arguments) {
+    use std::io::{ErrorKind, Write};
+    if let Err(error) = writeln!(std::io::stdout(), "{text}") {
+        if error.kind() == ErrorKind::BrokenPipe {
+            std::process::exit(0);
+        }
+        eprintln!("parallax: standard output: {error}");
+        std::process::exit(1);
+    }
 }

@@ -133,13 +133,20 @@ fn report(timing: &Timing, json: bool) -> Result<()> {
         return super::print_json(timing);
     }
     if !timing.breakdown.is_empty() {
-        println!(
+        say!(
             "{:32} {:16} {:>5} {:>8} {:>8} {:>10} {:>11} {:>6}",
-            "op", "kernel path", "calls", "GFLOP", "MB", "forward ms", "backward ms", "share"
+            "op",
+            "kernel path",
+            "calls",
+            "GFLOP",
+            "MB",
+            "forward ms",
+            "backward ms",
+            "share"
         );
     }
     for r in &timing.breakdown {
-        println!(
+        say!(
             "{:32} {:16} {:5} {:8.3} {:8.1} {:10.2} {:11.2} {:5.1}%",
             r.op,
             r.algo,
@@ -152,9 +159,9 @@ fn report(timing: &Timing, json: bool) -> Result<()> {
         );
     }
     if let (Some(rows), Some(other)) = (timing.rows_share, timing.other_share) {
-        println!("\nthe rows are {:.1}% of the median, {:.1}% is in none", 100.0 * rows, 100.0 * other);
+        say!("\nthe rows are {:.1}% of the median, {:.1}% is in none", 100.0 * rows, 100.0 * other);
     }
-    println!(
+    say!(
         "median {:.4} s on {} threads ({}), {:.2} GFLOP, {:.1} GFLOP/s, peak memory {:.0} MiB, {:.1} fresh buffers",
         timing.median,
         timing.threads,

@@ -108,16 +108,26 @@ fn passes(row: &Row, ceilings: Ceilings) -> Vec<Pass> {
 
 fn print(roofline: &Roofline) -> Result<()> {
     let Ceilings { gemm_gflops, memory_gbs } = roofline.ceilings;
-    println!(
+    say!(
         "on {} threads ({}): {gemm_gflops:.1} GFLOP/s in a product of 1024x1024 matrices, {memory_gbs:.1} GB/s in a = b + s c\n",
-        roofline.threads, roofline.simd
+        roofline.threads,
+        roofline.simd
     );
-    println!(
+    say!(
         "{:26} {:16} {:8} {:>5} {:>8} {:>8} {:>7} {:>9} {:10} {:>6}",
-        "op", "kernel path", "pass", "calls", "ms", "GFLOP/s", "GB/s", "FLOP/byte", "bound by", "share"
+        "op",
+        "kernel path",
+        "pass",
+        "calls",
+        "ms",
+        "GFLOP/s",
+        "GB/s",
+        "FLOP/byte",
+        "bound by",
+        "share"
     );
     for p in &roofline.passes {
-        println!(
+        say!(
             "{:26} {:16} {:8} {:5} {:8.2} {:8.1} {:7.1} {:9.1} {:10} {:5.0}%",
             p.op,
             p.algo,
@@ -131,7 +141,7 @@ fn print(roofline: &Roofline) -> Result<()> {
             100.0 * p.share
         );
     }
-    println!(
+    say!(
         "\nmedian step {:.4} s, {:.2} GFLOP: {:.1} GFLOP/s, {:.0}% of the large product's; at their ceilings the ops take {:.4} s",
         roofline.median,
         roofline.gflop,
