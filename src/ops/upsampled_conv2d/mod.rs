@@ -266,6 +266,7 @@ impl Checked for UpsampledConv2d {
             case("3x3 of an empty batch", plain, [0, 2, 3, 2], &[1], [3, 2], true).flat(),
             case("1x1", plain, [2, 2, 3, 3], &[2], [1, 4], true),
             case("1x1 without bias", plain, [1, 3, 2, 2], &[1, 0, 3], [1, 17], false),
+            case("1x1, no channel of it", plain, [1, 2, 2, 0], &[2], [1, 3], false),
             case("1x1 alone", plain, [2, 2, 2, 3], &[], [1, 2], true),
             case("1x1 of an empty batch", plain, [0, 2, 3, 2], &[1], [1, 2], true).flat(),
         ];

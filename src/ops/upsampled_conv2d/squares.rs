@@ -82,6 +82,9 @@ pub(super) fn convolve<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: &
 /// dx from dy: a pixel is seen from the four rows 2y - 1 .. 2y + 2 of the output, and from four columns. That is a
 /// convolution of dy by steps of two, with a 4x4 window.
 pub(super) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, dy: &[T], w: &[T]) {
+    if out.is_empty() {
+        return;
+    }
     let t = Geometry {
         size: [2 * g.size[0], 2 * g.size[1]],
         channels: g.out_channels,
@@ -121,6 +124,9 @@ fn turned<T: Float>(g: &Geometry, w: &[T]) -> Buffer<T> {
 /// were added to make it.
 pub(super) fn weight_gradient<T: Float>(out: &mut [T], g: &Geometry, x: &[T], dy: &[T]) {
     let (c, n, width, tile) = (g.channels, g.out_channels, g.out[1], tile(g));
+    if c * n == 0 {
+        return;
+    }
     let tiles = g.rows().div_ceil(tile);
     let parts = tiles.clamp(1, PARTS);
     let half = 2 * c * n;
@@ -160,9 +166,6 @@ pub(super) fn weight_gradient<T: Float>(out: &mut [T], g: &Geometry, x: &[T], dy
     sum_into(&mut sum, Accum::Replace, &sums);
     out.fill(T::ZERO);
     let block = c * n;
-    if block == 0 {
-        return;
-    }
     for (phase, sum) in PHASES.iter().zip(sum.chunks_exact(TAPS * block)) {
         for_each_tap(*phase, |k, t| add(&mut out[k * block..][..block], &sum[t * block..][..block]));
     }
