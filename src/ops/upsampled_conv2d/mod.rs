@@ -2,8 +2,8 @@
 //! square of four (nearest neighbour).
 //!
 //! On an enlarged image a window meets every pixel several times. Multiplied out, those weights can be added first, and
-//! the window laid on the small image: of a 3x3 window four products remain of nine ([`squares`]), of a 1x1 window one
-//! for four outputs ([`pointwise`]). The enlarged image is never made.
+//! the window laid on the small image: of a 3x3 window four products remain of nine (`squares`), of a 1x1 window one
+//! for four outputs (`pointwise`). The enlarged image is never made.
 
 mod pointwise;
 mod squares;
