@@ -3,6 +3,7 @@
 use super::batch_norm::add_sums;
 use super::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::pool::Buffer;
+use crate::tensor::simd::copy_run;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
 /// `out = q * (depthwise convolution of v as an image)`, with windows of several sizes, each over its own heads (Xu et
@@ -127,23 +128,41 @@ impl Plan {
         out
     }
 
-    /// An image surrounded by zeros, its channels filled up with zeros to whole blocks: every load is then of
-    /// [`LANES`] numbers, and none needs a condition. `fill(token, row)` writes the channels of a token.
-    fn padded<T: Float>(&self, fill: impl Fn(usize, &mut [T]) + Sync + Send) -> Buffer<T> {
-        let lanes = self.blocks.len() * LANES;
-        let row = self.padded_width() * lanes;
+    /// Where row y of a block begins in a padded image b, counted in pixels of [`LANES`] numbers.
+    fn row_of(&self, b: usize, y: usize, k: usize) -> usize {
+        ((b * self.padded_height() + y) * self.blocks.len() + k) * self.padded_width()
+    }
+
+    /// An image surrounded by zeros, its channels filled up with zeros to whole blocks, each row block by block: every
+    /// load is then of [`LANES`] numbers beside the last ones, and none needs a condition. `fill(token, channel, out)`
+    /// writes the channels of a token from one on.
+    fn padded<T: Float>(&self, fill: impl Fn(usize, usize, &mut [T]) + Sync + Send) -> Buffer<T> {
+        let across = self.padded_width() * LANES;
         let (height, pad) = (self.padded_height(), self.pad);
-        let mut out = Buffer::stale(self.batch * height * row);
+        let mut out = Buffer::stale(self.batch * height * self.blocks.len() * across);
         let work = out.len();
-        parallel::for_each_chunk(&mut out, row, work, |i, out| {
+        parallel::for_each_chunk(&mut out, self.blocks.len() * across, work, |i, out| {
             let (b, y) = (i / height, i % height);
-            out.fill(T::ZERO);
-            if (pad..pad + self.height).contains(&y) {
-                let first = (b * self.height + y - pad) * self.width;
-                for (x, out) in out.chunks_exact_mut(lanes).skip(pad).take(self.width).enumerate() {
-                    fill(first + x, &mut out[..self.channels]);
-                }
+            if !(pad..pad + self.height).contains(&y) {
+                return out.fill(T::ZERO);
             }
+            let token = (b * self.height + y - pad) * self.width;
+            simd::dispatch(
+                #[inline(always)]
+                || {
+                    for (k, out) in out.chunks_exact_mut(across).enumerate() {
+                        let (left, rest) = out.split_at_mut(pad * LANES);
+                        let (inside, right) = rest.split_at_mut(self.width * LANES);
+                        left.fill(T::ZERO);
+                        right.fill(T::ZERO);
+                        for (x, out) in inside.chunks_exact_mut(LANES).enumerate() {
+                            let (out, unused) = out.split_at_mut(LANES.min(self.channels - k * LANES));
+                            fill(token + x, k * LANES, out);
+                            unused.fill(T::ZERO);
+                        }
+                    }
+                },
+            );
         });
         out
     }
@@ -179,17 +198,14 @@ impl Plan {
         emit: &mut impl FnMut(usize, usize, [T; LANES]),
     ) {
         let ((image, _), (taps, _)) = (image.as_chunks::<LANES>(), taps.as_chunks::<LANES>());
-        let (n, across) = (self.blocks.len(), self.padded_width());
         for (k, block) in self.blocks.iter().enumerate() {
             let (window, ring) = (block.window, self.pad - block.window / 2);
             let taps = &taps[block.from..][..window * window];
-            let top = (b * self.padded_height() + y + ring) * across + x + ring;
             let mut sums = [[T::ZERO; LANES]; P];
             for (dy, taps) in taps.chunks_exact(window).enumerate() {
-                let pixels = &image[(top + dy * across) * n + k..][..(window + P - 2) * n + 1];
-                for (dx, tap) in taps.iter().enumerate() {
-                    for (p, sum) in sums.iter_mut().enumerate() {
-                        let pixel = &pixels[(dx + p) * n];
+                let row = &image[self.row_of(b, y + ring + dy, k) + ring + x..];
+                for (pixels, tap) in row.windows(P).zip(taps) {
+                    for (sum, pixel) in sums.iter_mut().zip(pixels) {
                         for (s, (&p, &t)) in sum.iter_mut().zip(pixel.iter().zip(tap)) {
                             *s = p.mul_add(t, *s);
                         }
@@ -232,7 +248,6 @@ impl Plan {
         g: &[[T; LANES]],
         s: Span,
     ) -> usize {
-        let (n, across) = (self.blocks.len(), self.padded_width());
         let ring = self.pad - s.block.window / 2;
         let mut result = [[T::ZERO; LANES]; G];
         simd::dispatch(
@@ -241,13 +256,10 @@ impl Plan {
                 // Sums that live outside the closure would be stored to memory at every step.
                 let mut sums = result;
                 for y in s.rows {
-                    let row = s.b * self.padded_height() + y;
-                    let g = &g[((row + self.pad) * across + self.pad) * n + s.k..];
-                    let v = &image[((row + ring + s.dy) * across + ring + s.dx) * n + s.k..];
-                    for x in 0..self.width {
-                        let g = &g[x * n];
-                        for (j, sums) in sums.iter_mut().enumerate() {
-                            let v = &v[(x + j) * n];
+                    let g = &g[self.row_of(s.b, y + self.pad, s.k) + self.pad..][..self.width];
+                    let v = &image[self.row_of(s.b, y + ring + s.dy, s.k) + ring + s.dx..];
+                    for (g, v) in g.iter().zip(v.windows(G)) {
+                        for (sums, v) in sums.iter_mut().zip(v) {
                             for (s, (&g, &v)) in sums.iter_mut().zip(g.iter().zip(v)) {
                                 *s = g.mul_add(v, *s);
                             }
@@ -260,6 +272,11 @@ impl Plan {
         out[..G].copy_from_slice(&result);
         G
     }
+}
+
+/// Writes channels of v of a token, of q, k and v side by side.
+fn v_of<T: Float>(qkv: &[T], channels: usize) -> impl Fn(usize, usize, &mut [T]) {
+    move |token, first, out| copy_run(out, &qkv[(3 * token + 2) * channels + first..][..out.len()])
 }
 
 /// Which part of the gradient of the taps.
@@ -311,43 +328,42 @@ impl<T: Float> Op<T> for ConvRelativePosition {
         let weights: Vec<Tensor<T>> = inputs[1..].iter().step_by(2).map(|&w| w.clone()).collect();
         let mut bias = Vec::with_capacity(channels);
         inputs[1..].iter().skip(1).step_by(2).for_each(|b| bias.extend_from_slice(b.data()));
+        bias.resize(plan.blocks.len() * LANES, T::ZERO);
         let taps = plan.arrange(&weights, false);
-        let image =
-            plan.padded(|token, out| out.copy_from_slice(&qkv.data()[token * stride + 2 * channels..][..channels]));
-        let mut conv = Buffer::stale(qkv.len() / 3);
+        let image = plan.padded(v_of(qkv.data(), channels));
+        // Only the gradient of q needs the convolution itself.
+        let mut conv = needs.get(0).then(|| Buffer::stale(qkv.len() / 3));
         let work = qkv.len() * plan.taps / plan.blocks.len();
         let line = plan.width * channels;
-        parallel::for_each_chunk(&mut conv, line, work, |i, out| {
-            simd::dispatch(
-                #[inline(always)]
-                || {
-                    plan.row(
-                        &image,
-                        &taps,
-                        i / plan.height,
-                        i % plan.height,
-                        #[inline(always)]
-                        |x, k, sum| {
-                            let lanes = k * LANES..((k + 1) * LANES).min(channels);
-                            let terms = sum.iter().zip(&bias[lanes.clone()]);
-                            let out = &mut out[x * channels..][..channels][lanes];
-                            out.iter_mut().zip(terms).for_each(|(o, (&s, &b))| *o = s + b);
-                        },
-                    );
-                },
-            );
-        });
         let y = Tensor::build([plan.batch, plan.height * plan.width, channels], |out| {
-            let work = out.len();
-            parallel::for_each_chunk(out, line, work, |i, out| {
-                let tokens = qkv.data()[i * plan.width * stride..].chunks_exact(stride);
-                let rows = conv[i * line..][..line].chunks_exact(channels).zip(tokens);
-                for (out, (conv, q)) in out.chunks_exact_mut(channels).zip(rows) {
-                    out.iter_mut().zip(conv.iter().zip(q)).for_each(|(o, (&c, &q))| *o = c * q);
-                }
+            let mut kept = conv.iter_mut().flat_map(|conv| conv.chunks_mut(line.max(1)));
+            let rows = out.chunks_mut(line.max(1)).enumerate().map(|(i, out)| (i, out, kept.next()));
+            parallel::for_each_piece(rows, work, |(i, out, mut kept)| {
+                let q = &qkv.data()[i * plan.width * stride..];
+                simd::dispatch(
+                    #[inline(always)]
+                    || {
+                        plan.row(
+                            &image,
+                            &taps,
+                            i / plan.height,
+                            i % plan.height,
+                            #[inline(always)]
+                            |x, k, mut sum| {
+                                let (first, count) = (k * LANES, LANES.min(channels - k * LANES));
+                                sum.iter_mut().zip(&bias[first..first + LANES]).for_each(|(s, &b)| *s += b);
+                                let at = x * channels + first;
+                                if let Some(kept) = &mut kept {
+                                    copy_run(&mut kept[at..at + count], &sum[..count]);
+                                }
+                                sum.iter_mut().zip(&q[x * stride + first..]).for_each(|(s, &q)| *s *= q);
+                                copy_run(&mut out[at..at + count], &sum[..count]);
+                            },
+                        );
+                    },
+                );
             });
         });
-        let conv = needs.get(0).then_some(conv);
         (vec![y], needs.any().then(|| Saved { qkv: qkv.clone(), weights, conv }))
     }
 
@@ -359,8 +375,8 @@ impl<T: Float> Op<T> for ConvRelativePosition {
         let plan = self.plan(qkv.shape()).expect("checked by the shape rule");
         let (channels, stride) = (plan.channels, 3 * plan.channels);
         let (qkv, g) = (qkv.data(), g.data());
-        let u = plan.padded(|token, out| {
-            let (g, q) = (&g[token * channels..][..channels], &qkv[token * stride..][..channels]);
+        let u = plan.padded(|token, first, out| {
+            let (g, q) = (&g[token * channels + first..], &qkv[token * stride + first..]);
             out.iter_mut().zip(g.iter().zip(q)).for_each(|(o, (&g, &q))| *o = g * q);
         });
         let work = qkv.len() * plan.taps / plan.blocks.len();
@@ -403,10 +419,7 @@ impl<T: Float> Op<T> for ConvRelativePosition {
             });
         });
         if (1..=2 * plan.windows.len()).any(|i| sink.wants(i)) {
-            let v = |token: usize, out: &mut [T]| {
-                out.copy_from_slice(&qkv[token * stride + 2 * channels..][..channels]);
-            };
-            let image = plan.padded(v);
+            let image = plan.padded(v_of(qkv, channels));
             parameters(&plan, &image, &u, work, sink);
         }
     }
@@ -424,9 +437,11 @@ fn parameters<T: Float>(plan: &Plan, image: &[T], u: &[T], work: usize, sink: &m
         plan.taps_gradient(taps, image, u, b, rows.clone());
         bias.fill(T::ZERO);
         for y in rows {
-            let row = ((b * plan.padded_height() + y + plan.pad) * plan.padded_width() + plan.pad) * lanes;
-            for u in u[row..][..plan.width * lanes].chunks_exact(lanes) {
-                bias.iter_mut().zip(u).for_each(|(s, &u)| *s += u);
+            for (k, bias) in bias.chunks_exact_mut(LANES).enumerate() {
+                let row = (plan.row_of(b, y + plan.pad, k) + plan.pad) * LANES;
+                for u in u[row..][..plan.width * LANES].chunks_exact(LANES) {
+                    bias.iter_mut().zip(u).for_each(|(s, &u)| *s += u);
+                }
             }
         }
     });

@@ -29,7 +29,7 @@ pub(super) fn forward<T: Float>(out: &mut [T], parts: &[Rows<T>], w: &[T], finis
     let n = out.len() / parts[0].rows.max(1);
     let tile = tile_rows(tile, k, n);
     let work = 2 * out.len() * k;
-    let panels = Panels::dense(w, k, n);
+    let panels = Panels::dense(w, k, n, parts[0].rows);
     parallel::for_each_chunk(out, tile * n, work, |i, out| {
         let rows = out.len() / n;
         let lines: Vec<Line<T>> = parts.iter().map(|x| line(x.rows(i * tile, rows))).collect();
@@ -61,7 +61,7 @@ fn forward_of_gelu<T: Float>(out: &mut [T], x: Rows<T>, w: &[T], finish: &Finish
     let n = out.len() / x.rows.max(1);
     let tile = tile_rows(tile, k, n);
     let work = (2 * n + 16) * x.rows * k;
-    let panels = Panels::dense(w, k, n);
+    let panels = Panels::dense(w, k, n, x.rows);
     parallel::for_each_chunk(out, tile * n, work, |i, out| {
         let rows = out.len() / n;
         let mut h = Buffer::stale(rows * k);

@@ -19,18 +19,32 @@ const VECTORS: usize = 2;
 /// sums.
 const LONGEST: usize = 256;
 
-/// The right operand of a product, cut into panels of [`VECTORS`] vectors of columns, one panel after the other, the
-/// last one filled up with zeros.
-pub(crate) struct Panels<T: Float> {
-    data: Buffer<T>,
+/// Rows of the left operand from which on a copy of the right one pays: each ten of them read it once.
+const MANY: usize = 160;
+
+/// The right operand of a product.
+pub(crate) struct Panels<'a, T: Float> {
+    data: Data<'a, T>,
     rows: usize,
     cols: usize,
     lanes: usize,
 }
 
-impl<T: Float> Panels<T> {
-    /// A dense matrix as it lies.
-    pub(crate) fn dense(matrix: &[T], rows: usize, cols: usize) -> Self {
+/// How the right operand lies.
+enum Data<'a, T: Float> {
+    /// Cut into panels of [`VECTORS`] vectors of columns, one panel after the other, the last one filled up with zeros.
+    Packed(Buffer<T>),
+    /// Row by row, in whole vectors.
+    Dense(&'a [T]),
+}
+
+impl<'a, T: Float> Panels<'a, T> {
+    /// A dense matrix, which `uses` rows are to be multiplied with.
+    pub(crate) fn dense(matrix: &'a [T], rows: usize, cols: usize, uses: usize) -> Self {
+        let lanes = simd::lanes::<T>();
+        if uses < MANY && cols.is_multiple_of(lanes) {
+            return Panels { data: Data::Dense(&matrix[..rows * cols]), rows, cols, lanes };
+        }
         Self::pack(rows, cols, |first, width, step, panel| {
             for (out, row) in panel.chunks_exact_mut(step).zip(matrix.chunks_exact(cols)) {
                 copy_run(&mut out[..width], &row[first..first + width]);
@@ -74,7 +88,7 @@ impl<T: Float> Panels<T> {
                 );
             });
         }
-        Panels { data, rows, cols, lanes }
+        Panels { data: Data::Packed(data), rows, cols, lanes }
     }
 }
 
@@ -94,7 +108,7 @@ pub(crate) struct Product<'a, T: Float> {
     pub(crate) out_step: usize,
     pub(crate) accum: Accum,
     pub(crate) lines: &'a [Line<'a, T>],
-    pub(crate) panels: &'a Panels<T>,
+    pub(crate) panels: &'a Panels<'a, T>,
 }
 
 impl<T: Float> Product<'_, T> {
@@ -119,34 +133,59 @@ impl<T: Float> Product<'_, T> {
     }
 
     #[inline(always)]
-    fn panel<S: Simd, const P: usize, const N: usize>(&mut self, simd: S, first: usize) {
+    fn panels<S: Simd, const DENSE: bool>(&mut self, simd: S) {
+        let lanes = self.panels.lanes;
+        let end = self.panels.cols.next_multiple_of(lanes);
+        let mut first = 0;
+        // Of 16 registers, ten sums and two factors leave some to spare; of 32, twenty.
+        while first + VECTORS * lanes <= end {
+            match S::REGISTER_COUNT {
+                0..32 => self.panel::<S, 5, VECTORS, DENSE>(simd, first),
+                _ => self.panel::<S, 10, VECTORS, DENSE>(simd, first),
+            }
+            first += VECTORS * lanes;
+        }
+        if first < end {
+            self.panel::<S, 10, 1, DENSE>(simd, first);
+        }
+    }
+
+    #[inline(always)]
+    fn panel<S: Simd, const P: usize, const N: usize, const DENSE: bool>(&mut self, simd: S, first: usize) {
         // What lies behind the last row's numbers may be missing.
         let rows = (self.out.len() + self.out_step - self.panels.cols) / self.out_step;
-        let panel = &self.panels.data[first * self.panels.rows..][..self.panels.rows * N * T::lanes::<S>()];
+        let panel = match &self.panels.data {
+            Data::Packed(data) => &data[first * self.panels.rows..][..self.panels.rows * N * T::lanes::<S>()],
+            Data::Dense(matrix) => &matrix[first..],
+        };
         let mut at = 0;
         while at + P <= rows {
-            self.tile::<S, P, N>(simd, panel, at, first);
+            self.tile::<S, P, N, DENSE>(simd, panel, at, first);
             at += P;
         }
         while at + 4 <= rows {
-            self.tile::<S, 4, N>(simd, panel, at, first);
+            self.tile::<S, 4, N, DENSE>(simd, panel, at, first);
             at += 4;
         }
         while at < rows {
-            self.tile::<S, 1, N>(simd, panel, at, first);
+            self.tile::<S, 1, N, DENSE>(simd, panel, at, first);
             at += 1;
         }
     }
 
     #[inline(always)]
-    fn tile<S: Simd, const P: usize, const N: usize>(&mut self, simd: S, panel: &[T], at: usize, first: usize) {
-        let lanes = T::lanes::<S>();
+    fn tile<S: Simd, const P: usize, const N: usize, const DENSE: bool>(
+        &mut self,
+        simd: S,
+        panel: &[T],
+        at: usize,
+        first: usize,
+    ) {
+        let width = if DENSE { self.panels.cols } else { N * T::lanes::<S>() };
         let mut sums = [[T::splat(simd, T::ZERO); N]; P];
         let (mut terms, mut accum) = (0, self.accum);
-        let mut rest = panel;
+        let mut above = 0;
         for Line { data, step, run } in self.lines.iter().copied() {
-            let (b, others) = rest.split_at(run * N * lanes);
-            rest = others;
             for from in (0..run).step_by(LONGEST) {
                 let count = LONGEST.min(run - from);
                 if terms + count > LONGEST {
@@ -156,17 +195,19 @@ impl<T: Float> Product<'_, T> {
                 }
                 terms += count;
                 let a: [&[T]; P] = std::array::from_fn(|p| &data[(at + p) * step + from..][..count]);
-                let b = &b[from * N * lanes..][..count * N * lanes];
-                for (j, b) in b.chunks_exact(N * lanes).enumerate() {
-                    let b: [_; N] = std::array::from_fn(|q| T::load(simd, &b[q * lanes..]));
-                    for p in 0..P {
-                        let x = T::splat(simd, a[p][j]);
-                        for q in 0..N {
-                            sums[p][q] = T::fma(simd, x, b[q], sums[p][q]);
-                        }
+                let b = &panel[(above + from) * width..];
+                // The same twice: only where it is known that rows follow each other is nothing checked in the loop.
+                if DENSE {
+                    for (j, b) in (0..count).zip(b.chunks(width)) {
+                        multiply(simd, &mut sums, a, j, &b[..N * T::lanes::<S>()]);
+                    }
+                } else {
+                    for (j, b) in b[..count * width].chunks_exact(width).enumerate() {
+                        multiply(simd, &mut sums, a, j, b);
                     }
                 }
             }
+            above += run;
         }
         self.settle(simd, at, first, sums, accum);
     }
@@ -205,24 +246,32 @@ fn settle<T: Float, S: Simd>(simd: S, out: &mut [T], sum: T::V<S>, accum: Accum)
     }
 }
 
+/// Adds the products of a row of the panel, and of what it meets in each row of the left operand.
+#[inline(always)]
+fn multiply<T: Float, S: Simd, const P: usize, const N: usize>(
+    simd: S,
+    sums: &mut [[T::V<S>; N]; P],
+    a: [&[T]; P],
+    j: usize,
+    b: &[T],
+) {
+    let b: [_; N] = std::array::from_fn(|q| T::load(simd, &b[q * T::lanes::<S>()..]));
+    for p in 0..P {
+        let x = T::splat(simd, a[p][j]);
+        for q in 0..N {
+            sums[p][q] = T::fma(simd, x, b[q], sums[p][q]);
+        }
+    }
+}
+
 impl<T: Float> WithSimd for Product<'_, T> {
     type Output = ();
 
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
-        let lanes = self.panels.lanes;
-        let end = self.panels.cols.next_multiple_of(lanes);
-        let mut first = 0;
-        // Of 16 registers, ten sums and two factors leave some to spare; of 32, twenty.
-        while first + VECTORS * lanes <= end {
-            match S::REGISTER_COUNT {
-                0..32 => self.panel::<S, 5, VECTORS>(simd, first),
-                _ => self.panel::<S, 10, VECTORS>(simd, first),
-            }
-            first += VECTORS * lanes;
-        }
-        if first < end {
-            self.panel::<S, 10, 1>(simd, first);
+        match self.panels.data {
+            Data::Packed(_) => self.panels::<S, false>(simd),
+            Data::Dense(_) => self.panels::<S, true>(simd),
         }
     }
 }
@@ -343,12 +392,12 @@ mod tests {
             (11, 33, 3, 9, 2),
             (9, 50, 1, 7, 3),
             (11, 3, 2, 600, 2),
+            (27, 24, 3, 300, 2),
         ] {
             let data = numbers(lines * ((rows - 1) * step + run));
             let lines = data.chunks((rows - 1) * step + run).map(|data| Line { data, step, run });
             let lines: Vec<Line<f64>> = lines.collect();
             let b = numbers(lines.len() * run * cols);
-            let panels = Panels::dense(&b, lines.len() * run, cols);
             let expected = |p: usize, n: usize| -> f64 {
                 let terms = lines
                     .iter()
@@ -357,8 +406,14 @@ mod tests {
                 terms.map(|(a, k)| a * b[k * cols + n]).sum()
             };
             for (accum, start) in [(Accum::Replace, 0.0), (Accum::Add, 0.5)] {
-                let mut out = vec![if accum == Accum::Add { start } else { f64::NAN }; rows * cols];
-                Product { out: &mut out, out_step: cols, accum, lines: &lines, panels: &panels }.run();
+                let product = |uses: usize| {
+                    let panels = Panels::dense(&b, lines.len() * run, cols, uses);
+                    let mut out = vec![if accum == Accum::Add { start } else { f64::NAN }; rows * cols];
+                    Product { out: &mut out, out_step: cols, accum, lines: &lines, panels: &panels }.run();
+                    out
+                };
+                let out = product(MANY);
+                assert_eq!(out, product(MANY - 1), "the same bits, packed and as it lies");
                 for (i, &found) in out.iter().enumerate() {
                     let expected = start + expected(i / cols, i % cols);
                     assert!((found - expected).abs() < 1e-12, "{rows}x{cols}, {i}: {found} for {expected}");
@@ -375,7 +430,7 @@ mod tests {
         let lines: Vec<Line<f64>> =
             (0..runs.len()).map(|l| Line { data: &data[l], step: steps[l], run: runs[l] }).collect();
         let b = numbers(274 * cols);
-        let panels = Panels::dense(&b, 274, cols);
+        let panels = Panels::dense(&b, 274, cols, rows);
         let mut out = vec![f64::NAN; rows * cols];
         Product { out: &mut out, out_step: cols, accum: Accum::Replace, lines: &lines, panels: &panels }.run();
         for (i, &found) in out.iter().enumerate() {
@@ -390,7 +445,7 @@ mod tests {
     fn rows_of_a_product_may_stand_apart() {
         let (rows, cols, run, step) = (14, 5, 3, 12);
         let (a, b) = (numbers(rows * run), numbers(run * cols));
-        let panels = Panels::dense(&b, run, cols);
+        let panels = Panels::dense(&b, run, cols, rows);
         let lines = [Line { data: &a, step: run, run }];
         // With and without what is missing behind the last row's numbers.
         for len in [rows * step, (rows - 1) * step + cols] {
@@ -409,7 +464,11 @@ mod tests {
     fn panels_of_a_transpose_are_those_of_the_matrix() {
         let b = numbers(7 * 21);
         let turned: Vec<f64> = (0..7 * 21).map(|i| b[(i % 7) * 21 + i / 7]).collect();
-        assert_eq!(*Panels::dense(&b, 7, 21).data, *Panels::transposed(&turned, 7, 21).data);
+        let [packed, of_transpose] = [Panels::dense(&b, 7, 21, MANY), Panels::transposed(&turned, 7, 21)];
+        let (Data::Packed(packed), Data::Packed(of_transpose)) = (packed.data, of_transpose.data) else {
+            panic!("packed, for as many uses");
+        };
+        assert_eq!(*packed, *of_transpose);
     }
 
     #[test]

@@ -53,6 +53,7 @@ impl<T: Float> Band<T> {
     }
 
     /// The row under row `ky` of the windows of the band's output row `r`.
+    #[inline(always)]
     pub(in crate::ops) fn line(&self, g: &Geometry, r: usize, ky: usize) -> &[T] {
         &self.data[(r * g.stride[0] + ky * g.dilation[0]) * self.line..][..self.line]
     }
@@ -85,7 +86,7 @@ pub(super) fn convolve<T: Float>(
     finish: &Finish<T>,
 ) {
     let (n, width, tile) = (g.out_channels, g.out[1], g.tile());
-    let panels = Panels::dense(w, g.patch(), n);
+    let panels = Panels::dense(w, g.patch(), n, g.rows() * width);
     let (step, run) = (g.stride[1] * g.channels, g.kernel[1] * g.channels);
     let work = 2 * g.rows() * width * g.patch() * n;
     parallel::for_each_chunk(out, tile * width * n, work, |i, out| {

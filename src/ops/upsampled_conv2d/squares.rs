@@ -58,7 +58,8 @@ fn tile(g: &Geometry) -> usize {
 /// `out = conv(x enlarged, w)`, or added to what is there; and finished.
 pub(super) fn convolve<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: &[T], w: &[T], finish: &Finish<T>) {
     let (c, n, width, tile) = (g.channels, g.out_channels, g.out[1], tile(g));
-    let panels = PHASES.map(|phase| Panels::dense(&weights_at(phase, g, w), TAPS * c, n));
+    let weights = PHASES.map(|phase| weights_at(phase, g, w));
+    let panels = weights.each_ref().map(|w| Panels::dense(w, TAPS * c, n, g.rows() * width));
     let row = 2 * width * n;
     let work = 2 * out.len() * TAPS * c;
     parallel::for_each_chunk(out, tile * 2 * row, work, |i, out| {
