@@ -370,9 +370,9 @@ impl Checked for Conv2d {
                 ("activated, tile and one", Conv2d { tile: 4, ..same }, [1, 5, 3, 2], [3, 3, 2, 2]),
                 ("activated, side by side", same, [1, 3, 4, 2], [3, 3, 2, 3]),
                 ("activated, reflected, side by side", same.reflecting(), [1, 3, 4, 2], [3, 3, 2, 3]),
-                ("activated, dot products", same, [1, 2, 3, 8], [3, 3, 8, 1]),
-                ("activated, reflected, dot products", same.reflecting(), [1, 2, 3, 8], [3, 3, 8, 1]),
-                ("activated, stride 2, dot products", same.strided(2), [1, 3, 4, 8], [3, 3, 8, 1]),
+                ("activated, dot products", same, [2, 4, 5, 8], [3, 3, 8, 1]),
+                ("activated, reflected, dot products", same.reflecting(), [2, 4, 5, 8], [3, 3, 8, 1]),
+                ("activated, stride 2, dot products", same.strided(2), [3, 7, 8, 8], [3, 3, 8, 1]),
                 ("activated, stride 2, side by side", Conv2d::padded(3).strided(2), [1, 4, 8, 1], [7, 7, 1, 3]),
             ];
             for (name, op, x, w) in paths {
@@ -388,7 +388,7 @@ impl Checked for Conv2d {
                 cases.push(parts(name, op.activated(activation), [2, 3, 5], &[2, 1], w, true));
             }
             let activated = same.activated(activation);
-            cases.push(parts("parts, activated, dot products", activated, [1, 2, 3], &[3, 6], [3, 3, 9, 1], true));
+            cases.push(parts("parts, activated, dot products", activated, [2, 4, 5], &[3, 6], [3, 3, 9, 1], true));
             cases.push(parts("parts, activated, side by side", activated, [1, 3, 4], &[1, 1], [3, 3, 2, 3], true));
             cases.push(case("activated without bias", same.activated(activation), [1, 4, 5, 3], [3, 3, 3, 2], false));
         }
