@@ -146,32 +146,13 @@ pub(super) fn sum_rows<T: Float>(out: &mut [T], x: &[T]) {
 #[inline(always)]
 fn sum_rows_here<T: Float>(out: &mut [T], x: &[T]) {
     const BLOCK: usize = 64;
-    const WIDE: usize = 128;
     if let [sum] = out {
         *sum = pairwise_sum(x);
         return;
     }
     let (cols, rows) = (out.len(), x.len() / out.len());
-    // Narrow rows are summed as many side by side as make a wide one.
-    let together = (WIDE / cols).max(1);
     out.fill(T::ZERO);
-    if rows > BLOCK * together {
-        let (left, right) = x.split_at((rows / 2).next_multiple_of(BLOCK * together) * cols);
-        sum_rows(out, left);
-        let mut other = vec![T::ZERO; cols];
-        sum_rows(&mut other, right);
-        out.iter_mut().zip(other).for_each(|(s, x)| *s += x);
-    } else if together > 1 {
-        let mut sums = [T::ZERO; WIDE];
-        let sums = &mut sums[..together * cols];
-        let mut wide = x.chunks_exact(sums.len());
-        for row in &mut wide {
-            sums.iter_mut().zip(row).for_each(|(s, &x)| *s += x);
-        }
-        for row in sums.chunks_exact(cols).chain(wide.remainder().chunks_exact(cols)) {
-            out.iter_mut().zip(row).for_each(|(s, &x)| *s += x);
-        }
-    } else {
+    if rows <= BLOCK {
         // Four rows at a time: each addition to `out` waits for the one before.
         let mut fours = x.chunks_exact(4 * cols);
         for four in &mut fours {
@@ -184,7 +165,13 @@ fn sum_rows_here<T: Float>(out: &mut [T], x: &[T]) {
         for row in fours.remainder().chunks_exact(cols) {
             out.iter_mut().zip(row).for_each(|(s, &x)| *s += x);
         }
+        return;
     }
+    let (left, right) = x.split_at((rows / 2).next_multiple_of(BLOCK) * cols);
+    sum_rows(out, left);
+    let mut other = vec![T::ZERO; cols];
+    sum_rows(&mut other, right);
+    out.iter_mut().zip(other).for_each(|(s, x)| *s += x);
 }
 
 impl Checked for Sum {
@@ -200,7 +187,6 @@ impl Checked for Sum {
                 Case::new("channels", sum(3, 1), [x()]),
                 Case::new("nothing", sum(1, 0), [x()]),
                 Case::new("many rows", sum(0, 1), [Input::random("x", [150, 2])]),
-                Case::new("many wide rows", sum(0, 1), [Input::random("x", [70, 65])]),
                 Case::new("a long run", sum(0, 1), [Input::random("x", [600])]),
                 Case::new("a run in parts", sum(1, 1), [Input::random("x", [2, 1030])]),
                 Case::new("rows in parts", sum(0, 1), [Input::random("x", [1026, 2])]),

@@ -108,12 +108,10 @@ pub trait Vector: Copy + 'static {
     fn vector_add<S: Simd>(simd: S, a: Self::V<S>, b: Self::V<S>) -> Self::V<S>;
     /// a * b + c with one rounding.
     fn fma<S: Simd>(simd: S, a: Self::V<S>, b: Self::V<S>, c: Self::V<S>) -> Self::V<S>;
-    /// The sum of the elements.
-    fn vector_sum<S: Simd>(simd: S, a: Self::V<S>) -> Self;
 }
 
 macro_rules! vector {
-    ($t:ty, $v:ident, $lanes:ident, $splat:ident, $load:ident, $store:ident, $add:ident, $fma:ident, $of:ident, $of_mut:ident, $sum:ident) => {
+    ($t:ty, $v:ident, $lanes:ident, $splat:ident, $load:ident, $store:ident, $add:ident, $fma:ident, $of:ident, $of_mut:ident) => {
         impl Vector for $t {
             type V<S: Simd> = S::$v;
 
@@ -149,10 +147,6 @@ macro_rules! vector {
             fn fma<S: Simd>(simd: S, a: S::$v, b: S::$v, c: S::$v) -> S::$v {
                 simd.$fma(a, b, c)
             }
-            #[inline(always)]
-            fn vector_sum<S: Simd>(simd: S, a: S::$v) -> $t {
-                simd.$sum(a)
-            }
         }
     };
 }
@@ -167,8 +161,7 @@ vector!(
     add_f32s,
     mul_add_f32s,
     as_simd_f32s,
-    as_mut_simd_f32s,
-    reduce_sum_f32s
+    as_mut_simd_f32s
 );
 vector!(
     f64,
@@ -180,8 +173,7 @@ vector!(
     add_f64s,
     mul_add_f64s,
     as_simd_f64s,
-    as_mut_simd_f64s,
-    reduce_sum_f64s
+    as_mut_simd_f64s
 );
 
 /// Elements in a vector of the best instruction set of this machine.

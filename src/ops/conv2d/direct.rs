@@ -53,7 +53,6 @@ impl<T: Float> Band<T> {
     }
 
     /// The row under row `ky` of the windows of the band's output row `r`.
-    #[inline(always)]
     pub(in crate::ops) fn line(&self, g: &Geometry, r: usize, ky: usize) -> &[T] {
         &self.data[(r * g.stride[0] + ky * g.dilation[0]) * self.line..][..self.line]
     }

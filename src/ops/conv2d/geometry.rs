@@ -1,6 +1,6 @@
 //! How a convolution's input, window and output lie.
 
-use super::{Conv2d, dots};
+use super::Conv2d;
 use crate::ops::ShapeError;
 use crate::tensor::Shape;
 
@@ -13,17 +13,6 @@ pub enum Beyond {
     Mirrored,
     /// The pixel at the edge, again and again.
     Nearest,
-}
-
-/// How a convolution is computed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(in crate::ops) enum Path {
-    /// Windows are copied into a matrix.
-    Im2col,
-    /// Windows are multiplied where they lie, with so many neighbouring outputs as one pixel.
-    Direct(usize),
-    /// The same to a single channel, as dot products.
-    Dots,
 }
 
 /// Everything about a convolution but its numbers. Pairs are (height, width).
@@ -153,23 +142,14 @@ impl Geometry {
         fitting.clamp(1, self.rows().div_ceil(4).max(1))
     }
 
-    /// How this convolution is best computed.
-    pub(in crate::ops) fn path(&self) -> Path {
-        match self.is_direct() {
-            false => Path::Im2col,
-            true if self.out_channels == 1 && self.channels >= dots::MANY => Path::Dots,
-            true => Path::Direct(self.side_by_side()),
-        }
-    }
-
     /// How many neighbouring outputs of a row are best computed as one pixel with as many times the channels; 1 if each
     /// by itself.
     ///
     /// A product fills vector registers along the output's channels. Where these are few, `s` pixels side by side fill
     /// them better: they share a window that is `s - 1` strides wider, whose weights are zero where a pixel does not
     /// look. That is more arithmetic, but at the full width of the registers.
-    fn side_by_side(&self) -> usize {
-        if self.kernel[1] == 1 {
+    pub(in crate::ops) fn side_by_side(&self) -> usize {
+        if !self.is_direct() || self.kernel[1] == 1 {
             return 1;
         }
         let fits = [1, 2, 4, 8, 16].into_iter().filter(|s| self.out[1].is_multiple_of(*s) && self.out[1] > 0);

@@ -1,8 +1,8 @@
 //! The three products of a convolution, tile by tile: outputs, the gradient of the input, the gradient of the weights.
 
-use super::geometry::{Beyond, Geometry, Path};
+use super::direct;
+use super::geometry::{Beyond, Geometry};
 use super::parts::{Part, in_one_piece, whole};
-use super::{direct, dots};
 use crate::ops::fused::Finish;
 use crate::ops::linear::sum_into;
 use crate::tensor::gemm::{Rows, RowsMut, gemm};
@@ -62,11 +62,10 @@ pub(in crate::ops) fn convolve<T: Float>(
     w: &[T],
     finish: &Finish<T>,
 ) {
-    match g.path() {
-        Path::Im2col => product(out, accum, g, in_one_piece(g, x, &mut None), w, finish),
-        Path::Dots => dots::convolve(out, accum, g, x, w, finish),
-        Path::Direct(1) => direct::convolve(out, accum, g, x, w, finish),
-        Path::Direct(s) => direct::convolve(out, accum, &g.widened(s), x, &widened(g, s, w), finish),
+    match g.side_by_side() {
+        _ if !g.is_direct() => product(out, accum, g, in_one_piece(g, x, &mut None), w, finish),
+        1 => direct::convolve(out, accum, g, x, w, finish),
+        s => direct::convolve(out, accum, &g.widened(s), x, &widened(g, s, w), finish),
     }
 }
 

@@ -1,12 +1,11 @@
 //! 2-D convolution: windows times weights. A 1x1 convolution is a product of the pixels as they lie.
 //!
 //! In this layout the window of one output pixel is `kernel height` contiguous runs of `kernel width * channels` numbers.
-//! `direct` multiplies these runs where they lie in a padded row, and `dots` does so for a single channel of output;
-//! grouped convolutions, and those dilated along the row, whose windows are not whole runs, are copied into an im2col
-//! matrix in tiles that fit the cache (`kernel`). Reflection padding is a matter of what is copied, and costs nothing.
+//! `direct` multiplies these runs where they lie in a padded row; grouped convolutions, and those dilated along the row,
+//! whose windows are not whole runs, are copied into an im2col matrix in tiles that fit the cache (`kernel`). Reflection
+//! padding is a matter of what is copied, and costs nothing.
 
 pub(super) mod direct;
-mod dots;
 pub(super) mod geometry;
 pub(super) mod kernel;
 pub(super) mod parts;
@@ -16,7 +15,7 @@ use super::linear;
 use super::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::gemm::Rows;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
-use geometry::{Geometry, Path};
+use geometry::Geometry;
 use parts::Part;
 
 /// `x [batch, height, width, in]`, `w [kh, kw, in / groups, out]`, optionally `b [out]`
@@ -125,23 +124,19 @@ impl<T: Float> Op<T> for Conv2d {
 
     fn algo(&self, inputs: &[Shape]) -> &'static str {
         let Ok(g) = self.geometry(inputs) else { return "none" };
-        let names = match g.path() {
+        let names = match g.side_by_side() {
             _ if self.parts > 1 && self.is_pointwise(g.kernel) => paths!("parts_pointwise"),
-            Path::Im2col if self.parts > 1 => paths!("parts_im2col"),
-            Path::Dots if self.parts > 1 => paths!("parts_dots"),
-            Path::Direct(1) if self.parts > 1 => paths!("parts_direct"),
-            Path::Direct(_) if self.parts > 1 => paths!("parts_side_by_side"),
+            _ if self.parts > 1 && !g.is_direct() => paths!("parts_im2col"),
+            1 if self.parts > 1 => paths!("parts_direct"),
+            _ if self.parts > 1 => paths!("parts_side_by_side"),
             _ if self.is_pointwise(g.kernel) => paths!("pointwise"),
-            Path::Im2col => paths!("im2col"),
-            Path::Dots if self.reflect => paths!("dots_reflect"),
-            Path::Dots if self.stride != [1; 2] => paths!("dots_strided"),
-            Path::Dots => paths!("dots"),
-            Path::Direct(1) if self.reflect => paths!("direct_reflect"),
-            Path::Direct(1) if self.stride != [1; 2] => paths!("direct_strided"),
-            Path::Direct(1) => paths!("direct"),
-            Path::Direct(_) if self.reflect => paths!("side_by_side_reflect"),
-            Path::Direct(_) if self.stride != [1; 2] => paths!("side_by_side_strided"),
-            Path::Direct(_) => paths!("side_by_side"),
+            _ if !g.is_direct() => paths!("im2col"),
+            1 if self.reflect => paths!("direct_reflect"),
+            1 if self.stride != [1; 2] => paths!("direct_strided"),
+            1 => paths!("direct"),
+            _ if self.reflect => paths!("side_by_side_reflect"),
+            _ if self.stride != [1; 2] => paths!("side_by_side_strided"),
+            _ => paths!("side_by_side"),
         };
         self.activation.among(names)
     }
@@ -339,13 +334,6 @@ impl Checked for Conv2d {
             case("many channels", same, [1, 3, 5, 1], [3, 3, 1, 70], false),
             case("several register tiles", same, [1, 2, 15, 4], [3, 3, 4, 17], true),
             case("register tiles of few rows and many columns", same, [1, 2, 11, 4], [3, 3, 4, 16], false),
-            case("dot products", same, [2, 3, 4, 8], [3, 3, 8, 1], true),
-            case("dot products, channels left over", same, [1, 2, 3, 11], [3, 3, 11, 1], false),
-            case("dot products, reflected", same.reflecting(), [2, 3, 4, 9], [3, 3, 9, 1], true),
-            case("dot products, stride 2", same.strided(2), [1, 4, 5, 8], [3, 3, 8, 1], true),
-            case("dot products, tile and one", Conv2d { tile: 4, ..same }, [1, 5, 2, 8], [3, 3, 8, 1], false),
-            case("dot products back to one channel", same, [1, 3, 4, 1], [3, 3, 1, 9], false),
-            parts("parts, dot products", same, [2, 3, 4], &[5, 6], [3, 3, 11, 1], true),
             parts("two parts", same, [2, 4, 5], &[3, 2], [3, 3, 5, 4], true),
             parts("four parts, one of them empty", same, [1, 3, 4], &[1, 0, 2, 1], [3, 3, 4, 17], false),
             parts("parts, stride 2", same.strided(2), [2, 5, 6], &[2, 1], [3, 3, 3, 3], true),
@@ -370,9 +358,6 @@ impl Checked for Conv2d {
                 ("activated, tile and one", Conv2d { tile: 4, ..same }, [1, 5, 3, 2], [3, 3, 2, 2]),
                 ("activated, side by side", same, [1, 3, 4, 2], [3, 3, 2, 3]),
                 ("activated, reflected, side by side", same.reflecting(), [1, 3, 4, 2], [3, 3, 2, 3]),
-                ("activated, dot products", same, [2, 4, 5, 8], [3, 3, 8, 1]),
-                ("activated, reflected, dot products", same.reflecting(), [2, 4, 5, 8], [3, 3, 8, 1]),
-                ("activated, stride 2, dot products", same.strided(2), [3, 7, 8, 8], [3, 3, 8, 1]),
                 ("activated, stride 2, side by side", Conv2d::padded(3).strided(2), [1, 4, 8, 1], [7, 7, 1, 3]),
             ];
             for (name, op, x, w) in paths {
@@ -387,9 +372,8 @@ impl Checked for Conv2d {
             for (name, op, w) in paths {
                 cases.push(parts(name, op.activated(activation), [2, 3, 5], &[2, 1], w, true));
             }
-            let activated = same.activated(activation);
-            cases.push(parts("parts, activated, dot products", activated, [2, 4, 5], &[3, 6], [3, 3, 9, 1], true));
-            cases.push(parts("parts, activated, side by side", activated, [1, 3, 4], &[1, 1], [3, 3, 2, 3], true));
+            let side_by_side = same.activated(activation);
+            cases.push(parts("parts, activated, side by side", side_by_side, [1, 3, 4], &[1, 1], [3, 3, 2, 3], true));
             cases.push(case("activated without bias", same.activated(activation), [1, 4, 5, 3], [3, 3, 3, 2], false));
         }
         cases
