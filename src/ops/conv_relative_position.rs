@@ -28,8 +28,10 @@ pub struct ConvRelativePosition {
 
 /// The channels that are computed side by side.
 const LANES: usize = 16;
-/// Pixels of a row that are computed side by side.
-const SIDE_BY_SIDE: usize = 5;
+/// Pixels of a row that are computed side by side, where [`LANES`] numbers are one vector: ten sums.
+const MANY: usize = 10;
+/// The same, where they are two.
+const FEW: usize = 5;
 /// The extent of the largest window that is taken.
 const LARGEST: usize = 15;
 
@@ -177,10 +179,15 @@ impl Plan {
         y: usize,
         mut emit: impl FnMut(usize, usize, [T; LANES]),
     ) {
+        let fits = simd::lanes::<T>() >= LANES;
         let mut x = 0;
-        while x + SIDE_BY_SIDE <= self.width {
-            self.pixels::<T, SIDE_BY_SIDE>(image, taps, [b, y, x], &mut emit);
-            x += SIDE_BY_SIDE;
+        while fits && x + MANY <= self.width {
+            self.pixels::<T, MANY>(image, taps, [b, y, x], &mut emit);
+            x += MANY;
+        }
+        while x + FEW <= self.width {
+            self.pixels::<T, FEW>(image, taps, [b, y, x], &mut emit);
+            x += FEW;
         }
         while x < self.width {
             self.pixels::<T, 1>(image, taps, [b, y, x], &mut emit);

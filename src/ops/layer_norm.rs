@@ -1,8 +1,11 @@
 //! Layer normalisation over the last axis.
 
+use pulp::{Simd, WithSimd};
+
 use super::batch_norm::add_sums;
 use super::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::pool::Buffer;
+use crate::tensor::simd::dispatch_vector;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
 /// `y = (x - mean) / sqrt(var + eps) * weight + bias`, mean and biased variance of each row of x [.., C] (Ba, Kiros and
@@ -46,13 +49,52 @@ pub(super) fn sum<T: Float>(a: &[T], b: &[T], f: impl Fn(T, T) -> T) -> T {
     sums[0]
 }
 
-/// Mean and 1 / sqrt(var + eps) of a row, in two passes.
-#[inline(always)]
-fn statistics<T: Float>(x: &[T], eps: T) -> (T, T) {
-    let share = T::ONE / T::of(x.len() as f64);
-    let mean = sum(x, x, |x, _| x) * share;
-    let var = sum(x, x, |x, _| (x - mean) * (x - mean)) * share;
-    (mean, T::ONE / (var + eps).sqrt())
+/// Mean and 1 / sqrt(var + eps) of every row of x, in two passes over it.
+///
+/// Rows are short: what counts is the sum over a vector's elements at the end of each, which the compiler makes of a plain
+/// loop one element after the other.
+struct Moments<'a, T> {
+    x: &'a [T],
+    eps: T,
+    out: &'a mut [[T; 2]],
+}
+
+impl<T: Float> WithSimd for Moments<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let (c, lanes) = (self.x.len() / self.out.len(), T::lanes::<S>());
+        let share = T::ONE / T::of(c as f64);
+        for (out, x) in self.out.iter_mut().zip(self.x.chunks_exact(c)) {
+            let (whole, rest) = x.split_at(c - c % lanes);
+            let mut sum = T::load_part(simd, rest);
+            for x in whole.chunks_exact(lanes) {
+                sum = T::vector_add(simd, sum, T::load(simd, x));
+            }
+            let mean = T::total(simd, sum) * share;
+            let mut squares = T::splat(simd, T::ZERO);
+            for x in whole.chunks_exact(lanes) {
+                let x = T::vector_add(simd, T::load(simd, x), T::splat(simd, -mean));
+                squares = T::fma(simd, x, x, squares);
+            }
+            let mut var = T::total(simd, squares);
+            for &x in rest {
+                var += (x - mean) * (x - mean);
+            }
+            let var = var * share;
+            *out = [mean, T::ONE / (var + self.eps).sqrt()];
+        }
+    }
+}
+
+/// Mean and 1 / sqrt(var + eps) of each row of `c` elements.
+fn moments<T: Float>(x: &[T], c: usize, eps: T) -> Vec<[T; 2]> {
+    let mut out = vec![[T::ZERO; 2]; x.len() / c];
+    if !out.is_empty() {
+        dispatch_vector(Moments { x, eps, out: &mut out });
+    }
+    out
 }
 
 impl LayerNorm {
@@ -81,11 +123,12 @@ impl<T: Float> Op<T> for LayerNorm {
             let work = 6 * out.len();
             parallel::for_each_chunk(out, chunk, work, |i, out| {
                 let x = &x.data()[i * chunk..][..out.len()];
+                let moments = moments(x, c, eps);
                 simd::dispatch(
                     #[inline(always)]
                     || {
-                        for (y, x) in out.chunks_exact_mut(c).zip(x.chunks_exact(c)) {
-                            let (mean, rstd) = statistics(x, eps);
+                        let rows = x.chunks_exact(c).zip(&moments);
+                        for (y, (x, &[mean, rstd])) in out.chunks_exact_mut(c).zip(rows) {
                             for ((y, &x), (&w, &b)) in y.iter_mut().zip(x).zip(weight.data().iter().zip(bias.data())) {
                                 *y = ((x - mean) * rstd).mul_add(w, b);
                             }
@@ -110,13 +153,12 @@ impl<T: Float> Op<T> for LayerNorm {
             let work = 10 * out.len();
             parallel::for_each_chunk(out, chunk, work, |i, out| {
                 let (x, g) = (&x.data()[i * chunk..][..out.len()], &g.data()[i * chunk..][..out.len()]);
-                let mut products = Buffer::<T>::stale(c);
+                let (mut products, moments) = (Buffer::<T>::stale(c), moments(x, c, eps));
                 simd::dispatch(
                     #[inline(always)]
                     || {
-                        let rows = x.chunks_exact(c).zip(g.chunks_exact(c));
-                        for (out, (x, g)) in out.chunks_exact_mut(c).zip(rows) {
-                            let (mean, rstd) = statistics(x, eps);
+                        let rows = x.chunks_exact(c).zip(g.chunks_exact(c)).zip(&moments);
+                        for (out, ((x, g), &[mean, rstd])) in out.chunks_exact_mut(c).zip(rows) {
                             products.iter_mut().zip(g.iter().zip(weight)).for_each(|(u, (&g, &w))| *u = g * w);
                             let level = sum(&products, x, |u, _| u) * share;
                             let slope = sum(&products, x, |u, x| u * (x - mean)) * share * rstd * rstd;
@@ -142,13 +184,13 @@ impl<T: Float> Op<T> for LayerNorm {
             let end = ((i + 1) * chunk).min(x.len());
             let (x, g) = (&x.data()[i * chunk..end], &g.data()[i * chunk..end]);
             let (dweight, dbias) = part.split_at_mut(c);
+            let moments = moments(x, c, eps);
             simd::dispatch(
                 #[inline(always)]
                 || {
                     dweight.fill(T::ZERO);
                     dbias.fill(T::ZERO);
-                    for (x, g) in x.chunks_exact(c).zip(g.chunks_exact(c)) {
-                        let (mean, rstd) = statistics(x, eps);
+                    for ((x, g), &[mean, rstd]) in x.chunks_exact(c).zip(g.chunks_exact(c)).zip(&moments) {
                         let sums = dweight.iter_mut().zip(dbias.iter_mut());
                         for ((dw, db), (&x, &g)) in sums.zip(x.iter().zip(g)) {
                             *dw = g.mul_add((x - mean) * rstd, *dw);

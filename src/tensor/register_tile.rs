@@ -146,7 +146,10 @@ impl<T: Float> Product<'_, T> {
             first += VECTORS * lanes;
         }
         if first < end {
-            self.panel::<S, 10, 1, DENSE>(simd, first);
+            match S::REGISTER_COUNT {
+                0..32 => self.panel::<S, 10, 1, DENSE>(simd, first),
+                _ => self.panel::<S, 20, 1, DENSE>(simd, first),
+            }
         }
     }
 
@@ -162,6 +165,10 @@ impl<T: Float> Product<'_, T> {
         while at + P <= rows {
             self.tile::<S, P, N, DENSE>(simd, panel, at, first);
             at += P;
+        }
+        if P == 20 && at + 10 <= rows {
+            self.tile::<S, 10, N, DENSE>(simd, panel, at, first);
+            at += 10;
         }
         while at + 4 <= rows {
             self.tile::<S, 4, N, DENSE>(simd, panel, at, first);
@@ -223,6 +230,18 @@ impl<T: Float> Product<'_, T> {
         accum: Accum,
     ) {
         let (lanes, cols) = (T::lanes::<S>(), self.panels.cols);
+        if first + N * lanes <= cols {
+            let out = &mut self.out[at * self.out_step + first..];
+            for (p, sums) in sums.into_iter().enumerate() {
+                let out = &mut out[p * self.out_step..][..N * lanes];
+                for (q, sum) in sums.into_iter().enumerate() {
+                    let out = &mut out[q * lanes..][..lanes];
+                    let sum = if accum == Accum::Add { T::vector_add(simd, T::load(simd, out), sum) } else { sum };
+                    T::store(simd, out, sum);
+                }
+            }
+            return;
+        }
         let out = self.out[at * self.out_step..].chunks_mut(self.out_step);
         for (out, sums) in out.zip(sums) {
             let out = &mut out[..cols];

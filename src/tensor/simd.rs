@@ -108,10 +108,12 @@ pub trait Vector: Copy + 'static {
     fn vector_add<S: Simd>(simd: S, a: Self::V<S>, b: Self::V<S>) -> Self::V<S>;
     /// a * b + c with one rounding.
     fn fma<S: Simd>(simd: S, a: Self::V<S>, b: Self::V<S>, c: Self::V<S>) -> Self::V<S>;
+    /// The sum of a vector's elements.
+    fn total<S: Simd>(simd: S, v: Self::V<S>) -> Self;
 }
 
 macro_rules! vector {
-    ($t:ty, $v:ident, $lanes:ident, $splat:ident, $load:ident, $store:ident, $add:ident, $fma:ident, $of:ident, $of_mut:ident) => {
+    ($t:ty, $v:ident, $lanes:ident, $splat:ident, $load:ident, $store:ident, $add:ident, $fma:ident, $total:ident, $of:ident, $of_mut:ident) => {
         impl Vector for $t {
             type V<S: Simd> = S::$v;
 
@@ -147,6 +149,10 @@ macro_rules! vector {
             fn fma<S: Simd>(simd: S, a: S::$v, b: S::$v, c: S::$v) -> S::$v {
                 simd.$fma(a, b, c)
             }
+            #[inline(always)]
+            fn total<S: Simd>(simd: S, v: S::$v) -> $t {
+                simd.$total(v)
+            }
         }
     };
 }
@@ -160,6 +166,7 @@ vector!(
     partial_store_f32s,
     add_f32s,
     mul_add_f32s,
+    reduce_sum_f32s,
     as_simd_f32s,
     as_mut_simd_f32s
 );
@@ -172,6 +179,7 @@ vector!(
     partial_store_f64s,
     add_f64s,
     mul_add_f64s,
+    reduce_sum_f64s,
     as_simd_f64s,
     as_mut_simd_f64s
 );
