@@ -18,7 +18,7 @@ use super::ablation;
 use super::progress::Progress;
 
 /// Steps of the default run.
-const STEPS: u64 = 3400;
+const STEPS: u64 = 3800;
 
 #[derive(clap::Args)]
 pub struct Args {

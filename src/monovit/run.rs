@@ -111,9 +111,9 @@ impl RunConfig {
                 ..LossConfig::default()
             },
             optim: OptimConfig {
-                encoder_rate: 7e-4,
-                rate: 7e-4,
-                pose_rate: 2e-3,
+                encoder_rate: 1e-3,
+                rate: 1e-3,
+                pose_rate: 2.8e-3,
                 decay: 0.01,
                 betas: [0.9, 0.999],
                 clip: 0.0,

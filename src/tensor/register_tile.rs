@@ -3,8 +3,9 @@
 //! A general product ([`gemm`](super::gemm)) copies both operands into an order of its own first. Convolutions need no
 //! such copy: the window of an output pixel is, for each of its rows, one run of numbers in the image, and the windows
 //! of its neighbours are the same run a step further on. A number of the left operand is spread over a vector and
-//! multiplied with a few vectors of the right one, for ten rows of the result at once, so that twenty sums wait for
-//! each other's additions. Every sum is made in one order, whatever the tile and the instruction set.
+//! multiplied with two vectors of the right one, for ten rows of the result at once (or with one, for twenty rows), so
+//! that none of twenty sums waits for its last addition. Every sum is made in one order, whatever the tile and the
+//! instruction set.
 
 use pulp::{Simd, WithSimd};
 
@@ -137,7 +138,7 @@ impl<T: Float> Product<'_, T> {
         let lanes = self.panels.lanes;
         let end = self.panels.cols.next_multiple_of(lanes);
         let mut first = 0;
-        // Of 16 registers, ten sums and two factors leave some to spare; of 32, twenty.
+        // Of 16 registers, ten sums and the factors leave some to spare; of 32, twenty.
         while first + VECTORS * lanes <= end {
             match S::REGISTER_COUNT {
                 0..32 => self.panel::<S, 5, VECTORS, DENSE>(simd, first),
@@ -166,7 +167,7 @@ impl<T: Float> Product<'_, T> {
             self.tile::<S, P, N, DENSE>(simd, panel, at, first);
             at += P;
         }
-        if P == 20 && at + 10 <= rows {
+        if P > 10 && at + 10 <= rows {
             self.tile::<S, 10, N, DENSE>(simd, panel, at, first);
             at += 10;
         }
@@ -231,13 +232,12 @@ impl<T: Float> Product<'_, T> {
     ) {
         let (lanes, cols) = (T::lanes::<S>(), self.panels.cols);
         if first + N * lanes <= cols {
+            // Known once for all rows, which leaves nothing to decide between the stores.
             let out = &mut self.out[at * self.out_step + first..];
             for (p, sums) in sums.into_iter().enumerate() {
                 let out = &mut out[p * self.out_step..][..N * lanes];
                 for (q, sum) in sums.into_iter().enumerate() {
-                    let out = &mut out[q * lanes..][..lanes];
-                    let sum = if accum == Accum::Add { T::vector_add(simd, T::load(simd, out), sum) } else { sum };
-                    T::store(simd, out, sum);
+                    settle(simd, &mut out[q * lanes..][..lanes], sum, accum);
                 }
             }
             return;
