@@ -4,7 +4,7 @@ mod common;
 
 use common::{compare, random};
 use criterion::{Criterion, criterion_group, criterion_main};
-use parallax::ops::batch_norm::Activation;
+use parallax::ops::normalise::batch_norm::Activation;
 use parallax::tensor::{Tensor, Var};
 
 const EPS: f64 = 1e-5;

@@ -4,11 +4,12 @@ use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use parallax::data::batch::{Augment, batch_of_step};
-use parallax::data::street::{Street, StreetConfig};
-use parallax::monovit::run::RunConfig;
-use parallax::monovit::{Preset, Trainer};
+use parallax::monovit::Preset;
 use parallax::nn::Context;
+use parallax::street::{Street, StreetConfig};
 use parallax::tensor::Var;
+use parallax::train::Trainer;
+use parallax::train::run::RunConfig;
 
 fn benches(c: &mut Criterion) {
     rayon::ThreadPoolBuilder::new().use_current_thread().build_global().expect("the first pool of this process");

@@ -7,12 +7,14 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::time::{Duration, Instant};
 
-use parallax::monovit::run::{RunConfig, load_weights};
-use parallax::monovit::start::Start;
-use parallax::monovit::weights::{Form, Need, Sources, Weights, load, preset_of, save};
+use parallax::formats::TensorFile;
+use parallax::formats::pth;
+use parallax::formats::pth::Saved;
 use parallax::monovit::{MonoVit, Preset};
-use parallax::nn::pth::{self, Saved};
-use parallax::nn::{Params, TensorFile};
+use parallax::nn::Params;
+use parallax::train::run::{RunConfig, load_weights};
+use parallax::train::start::Start;
+use parallax::weights::{Form, Need, Sources, Weights, load, preset_of, save};
 
 fn fixture(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)

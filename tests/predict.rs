@@ -8,11 +8,11 @@ use std::process::{Command, Output};
 use std::sync::OnceLock;
 
 use image::{DynamicImage, GenericImageView, ImageFormat, Rgb, RgbImage};
-use parallax::monovit::evaluation::Predictor;
-use parallax::monovit::run::{RunConfig, load_weights, write_weights};
+use parallax::eval::predictor::Predictor;
 use parallax::monovit::{MonoVit, Preset};
 use parallax::nn::Context;
 use parallax::tensor::{Tensor, Var, parallel, pool};
+use parallax::train::run::{RunConfig, load_weights, write_weights};
 
 /// The size that the network of these tests was made for.
 const HEIGHT: u32 = 64;

@@ -6,11 +6,11 @@ use std::process::{Command, Output};
 use std::sync::Arc;
 
 use parallax::data::Dataset;
-use parallax::data::street::{Street, StreetConfig};
 use parallax::monovit::Preset;
 use parallax::monovit::loss::{Reprojection, Scales};
-use parallax::monovit::run::{Ended, Event, Run, RunConfig, RunData, load_weights, read_config};
-use parallax::monovit::shake::Shake;
+use parallax::street::{Street, StreetConfig};
+use parallax::train::rotations::Shake;
+use parallax::train::run::{Ended, Event, Run, RunConfig, RunData, load_weights, read_config};
 
 fn street(seed: u64) -> Arc<dyn Dataset> {
     let config = StreetConfig { height: 64, width: 96, sequences: 1, frames: 8, seed, ..StreetConfig::default() };

@@ -8,12 +8,13 @@ use std::path::Path;
 use std::process::Command;
 
 use parallax::data::batch::{Augment, batch_of_step};
-use parallax::data::street::{Street, StreetConfig};
 use parallax::gradcheck::{cotangents, draw};
-use parallax::monovit::run::RunConfig;
-use parallax::monovit::{Preset, Trainer};
+use parallax::monovit::Preset;
 use parallax::ops::registry::{self, AnyCase};
+use parallax::street::{Street, StreetConfig};
 use parallax::tensor::{Float, Tape, Tensor, Var, simd};
+use parallax::train::Trainer;
+use parallax::train::run::RunConfig;
 
 /// Where the process of a level leaves its numbers.
 const OUT: &str = "PARALLAX_SIMD_TEST_OUT";

@@ -7,11 +7,11 @@ use image::RgbImage;
 use parallax::data::batch::to_tensor;
 use parallax::data::picture::{check_picture, read_picture};
 use parallax::data::resize::lanczos;
-use parallax::files::{check_writable, write_bytes_atomically};
-use parallax::monovit::attention::{Attention, AttentionRows, attention, saliency};
-use parallax::monovit::run::load_weights;
+use parallax::eval::attention::{Attention, AttentionRows, attention, saliency};
+use parallax::formats::atomic::{check_writable, write_bytes_atomically};
 use parallax::report::overlay::{Overlay, mark};
 use parallax::tensor::Tensor;
+use parallax::train::run::load_weights;
 use parallax::{Error, Result};
 use serde::Serialize;
 

@@ -2,8 +2,9 @@
 
 use std::path::PathBuf;
 
-use parallax::monovit::run::check_size;
-use parallax::monovit::weights::{self, Form, Need};
+use parallax::train::run::check_size;
+use parallax::weights;
+use parallax::weights::{Form, Need};
 use parallax::{Error, Result};
 
 #[derive(clap::Args)]

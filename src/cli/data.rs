@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use parallax::data::street::{Street, StreetConfig, export};
+use parallax::street::{Street, StreetConfig, export};
 use parallax::{Error, Result};
 
 use super::progress::Progress;

@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 use parallax::Result;
 use parallax::data::Dataset;
 use parallax::data::kitti::{DepthAxis, GroundTruth, Kitti, Options};
-use parallax::data::street::{Street, StreetConfig};
-use parallax::monovit::evaluation::{Evaluation, Predictor, evaluate};
-use parallax::monovit::metrics::{Protocol, Scale};
-use parallax::monovit::weights::Weights;
+use parallax::eval::metrics::{Protocol, Scale};
+use parallax::eval::predictor::{Evaluation, Predictor, evaluate};
+use parallax::street::{Street, StreetConfig};
+use parallax::weights::Weights;
 
 use super::progress::Progress;
 

@@ -3,7 +3,7 @@
 use parallax::Result;
 use parallax::monovit::MonoVit;
 use parallax::nn::Context;
-use parallax::ops::trace;
+use parallax::tensor::profile;
 use parallax::tensor::{Tensor, Var};
 use serde::Serialize;
 
@@ -41,9 +41,9 @@ pub fn run(args: Args) -> Result<()> {
     // Counted by running one picture: the arithmetic of an op is said by the op itself.
     let c = Context::inference(&params);
     let image = Var::constant(Tensor::zeros([1, args.height, args.width, 3]));
-    let (_, depth) = trace::record(false, || model.disparities(&c, &image));
-    let (_, pose) = trace::record(false, || model.transforms(&c, &image, &image, &image));
-    let count = |entries: &[trace::Entry]| entries.iter().map(|e| e.flops).sum::<u64>() as f64 * 1e-9;
+    let (_, depth) = profile::record(false, || model.disparities(&c, &image));
+    let (_, pose) = profile::record(false, || model.transforms(&c, &image, &image, &image));
+    let count = |entries: &[profile::Entry]| entries.iter().map(|e| e.flops).sum::<u64>() as f64 * 1e-9;
     let outputs: usize = depth.iter().chain(&pose).map(|e| e.output.len()).sum();
     let part = |prefix: &str| params.count(prefix);
     let batch = args.batch as f64;

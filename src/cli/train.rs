@@ -5,13 +5,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use parallax::data::kitti::{Kitti, Options};
-use parallax::data::street::{Street, StreetConfig};
 use parallax::data::{Dataset, Subset};
+use parallax::eval::metrics::Metrics;
 use parallax::monovit::Preset;
-use parallax::monovit::metrics::Metrics;
-use parallax::monovit::run::{Ended, Event, Run, RunConfig, RunData, RunMetrics, read_config};
-use parallax::monovit::start::Start;
-use parallax::monovit::weights::preset_of;
+use parallax::street::{Street, StreetConfig};
+use parallax::train::run::{Ended, Event, Run, RunConfig, RunData, RunMetrics, read_config};
+use parallax::train::start::Start;
+use parallax::weights::preset_of;
 use parallax::{Error, Result};
 
 use super::ablation;

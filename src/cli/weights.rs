@@ -3,8 +3,9 @@
 use std::path::PathBuf;
 
 use parallax::Result;
-use parallax::monovit::run::check_size;
-use parallax::monovit::weights::{self, Need, Weights};
+use parallax::train::run::check_size;
+use parallax::weights;
+use parallax::weights::{Need, Weights};
 
 #[derive(clap::Args)]
 pub struct WeightsArgs {

@@ -7,7 +7,7 @@ use image::RgbImage;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-use super::Intrinsics;
+use crate::camera::Intrinsics;
 
 /// A number in [0, 1): the upper 24 bits of the next 32-bit word, over 2^24. One word of the stream.
 pub fn uniform(rng: &mut ChaCha8Rng) -> f32 {

@@ -9,9 +9,10 @@ use std::thread::JoinHandle;
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
+use super::Dataset;
 use super::augment::{Jitter, flip, flip_intrinsics};
 use super::resize::lanczos;
-use super::{Dataset, Intrinsics};
+use crate::camera::Intrinsics;
 use crate::error::{Error, Result};
 use crate::random::Random;
 use crate::tensor::Tensor;
@@ -201,7 +202,7 @@ impl Drop for Loader {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::data::street::{Street, StreetConfig};
+    use crate::street::{Street, StreetConfig};
 
     #[test]
     fn smaller_sources_are_made_like_the_pyramid_of_the_target() {

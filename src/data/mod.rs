@@ -7,44 +7,14 @@ pub mod kitti;
 pub mod picture;
 pub mod pyramid;
 pub mod resize;
-pub mod street;
 
 use std::sync::Arc;
 
 use image::RgbImage;
-use serde::{Deserialize, Serialize};
 
 use crate::Result;
-
-/// Pinhole intrinsics in units of the image size, so that they hold at any resolution:
-/// `u = fx * W * x/z + cx * W`, `v = fy * H * y/z + cy * H`, pixel centres at whole numbers.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Intrinsics {
-    /// Focal length over the width.
-    pub fx: f64,
-    /// Focal length over the height.
-    pub fy: f64,
-    /// Principal point over the width.
-    pub cx: f64,
-    /// Principal point over the height.
-    pub cy: f64,
-}
-
-impl Intrinsics {
-    /// The published constants for KITTI: fx 0.58 W, fy 1.92 H, the centre in the middle.
-    pub const KITTI: Intrinsics = Intrinsics { fx: 0.58, fy: 1.92, cx: 0.5, cy: 0.5 };
-}
-
-/// A map of metric depth (camera z, metres), row-major, 0 where nothing is known.
-#[derive(Clone, Debug, PartialEq)]
-pub struct DepthMap {
-    /// Width in pixels.
-    pub width: usize,
-    /// Height in pixels.
-    pub height: usize,
-    /// `height * width` depths in metres; 0 means unknown.
-    pub metres: Vec<f32>,
-}
+use crate::camera::Intrinsics;
+use crate::depth::DepthMap;
 
 /// Samples for training and evaluation: each a target frame with its neighbours in time.
 pub trait Dataset: Send + Sync {

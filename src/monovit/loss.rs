@@ -3,10 +3,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::shake::Shake;
 use crate::error::{Error, Result};
 use crate::random::Random;
-use crate::tensor::{Float, Tensor, Var, trace};
+use crate::tensor::{Float, Tensor, Var, profile};
+use crate::train::rotations::Shake;
 
 /// What is made of the photometric errors of a pixel's sources.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -205,7 +205,7 @@ pub fn loss<T: Float>(
             let unwarped = if own { still(sources, target) } else { unwarped.clone() };
             candidates.extend(unwarped.into_iter().map(|error| match &mut ties {
                 Some((ties, random)) => {
-                    Var::constant(trace::phase("noise against ties", || ties.add(error.value(), random)))
+                    Var::constant(profile::phase("noise against ties", || ties.add(error.value(), random)))
                 }
                 None => error,
             }));
@@ -216,7 +216,7 @@ pub fn loss<T: Float>(
         sum_photometric += error.value().item().f64();
         sum_smoothness += weight * smoothness.value().item().f64();
         let count = || winner.data().iter().filter(|w| w.f64() < warped as f64).count();
-        let kept = trace::phase("pixels that auto-masking leaves", count);
+        let kept = profile::phase("pixels that auto-masking leaves", count);
         sum_mask += kept as f64 / winner.len().max(1) as f64;
         parts.push(error + smoothness.affine(weight, 0.0));
     }

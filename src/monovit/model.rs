@@ -6,7 +6,7 @@ use super::encoder::Encoder;
 use super::pose::{PoseDecoder, PoseEncoder};
 use crate::nn::{Builder, Context, Folded, Params};
 use crate::random::Random;
-use crate::tensor::{Float, Tensor, Var, trace};
+use crate::tensor::{Float, Tensor, Var, profile};
 
 /// Depth encoder and decoder, pose encoder and decoder: `encoder`, `depth`, `pose_encoder`, `pose` in a checkpoint.
 #[derive(Clone, Debug)]
@@ -58,15 +58,15 @@ impl MonoVit {
             let image = Tensor::build([1, h, w, channels], |out| out.copy_from_slice(numbers));
             let c = Context::folded(params);
             let scales = self.disparities(&c, &Var::constant(image));
-            trace::phase("freeing", || drop(c));
+            profile::phase("freeing", || drop(c));
             scales.into_iter().map(Var::into_value).collect::<Vec<_>>()
         };
-        let mut pictures = trace::map(count, picture);
+        let mut pictures = profile::map(count, picture);
         if count == 1 {
             return pictures.swap_remove(0);
         }
         let scale = |s: usize| Tensor::stack(&pictures.iter().map(|p| &p[s]).collect::<Vec<_>>());
-        trace::phase("pictures into a batch", || (0..4).map(scale).collect())
+        profile::phase("pictures into a batch", || (0..4).map(scale).collect())
     }
 
     /// Disparities from the encoder's maps.

@@ -6,7 +6,7 @@ use std::collections::HashMap;
 use super::Folded;
 use super::params::{ParamId, Params};
 use crate::random::Random;
-use crate::tensor::{Float, Gradients, Tape, Tensor, Var, trace};
+use crate::tensor::{Float, Gradients, Tape, Tensor, Var, profile};
 
 /// What normalisations do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -35,7 +35,7 @@ impl<T: Float> Context<T> {
     /// Training: parameters are leaves of `tape`, normalisation uses and moves batch statistics.
     pub fn training(params: &Params<T>, tape: &Tape<T>, random: Random) -> Self {
         let var = |p: &super::Param<T>| if p.learnt { tape.leaf(p.value.clone()) } else { p.value.clone().into() };
-        let vars = trace::phase("parameters to leaves", || params.iter().map(|(_, p)| var(p)).collect());
+        let vars = profile::phase("parameters to leaves", || params.iter().map(|(_, p)| var(p)).collect());
         Self::with(vars, Mode::Training, random)
     }
 
@@ -52,7 +52,7 @@ impl<T: Float> Context<T> {
 
     fn constant(params: &Params<T>, mode: Mode) -> Self {
         let vars =
-            trace::phase("parameters to leaves", || params.iter().map(|(_, p)| p.value.clone().into()).collect());
+            profile::phase("parameters to leaves", || params.iter().map(|(_, p)| p.value.clone().into()).collect());
         Self::with(vars, mode, Random::new(0, 0))
     }
 
@@ -99,7 +99,7 @@ impl<T: Float> Context<T> {
 
     /// Moves a running statistic: `(1 - momentum) old + momentum new`.
     pub fn move_running(&self, id: ParamId, new: &Tensor<T>, momentum: f64) {
-        trace::phase("running statistics", || {
+        profile::phase("running statistics", || {
             let mut value = self.running(id);
             let (keep, take) = (T::of(1.0 - momentum), T::of(momentum));
             value.data_mut().iter_mut().zip(new.data()).for_each(|(r, &n)| *r = keep * *r + take * n);
@@ -126,6 +126,6 @@ impl<T: Float> Context<T> {
 
     /// The gradient of every parameter that the output depends on.
     pub fn gradients(&self, gradients: &mut Gradients<T>) -> Vec<Option<Tensor<T>>> {
-        trace::phase("leaves to gradients", || self.vars.iter().map(|v| gradients.take(v)).collect())
+        profile::phase("leaves to gradients", || self.vars.iter().map(|v| gradients.take(v)).collect())
     }
 }

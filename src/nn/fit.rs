@@ -7,9 +7,9 @@ use std::sync::Arc;
 use serde::Serialize;
 
 use super::params::{ParamId, Params};
-use super::pth::shown;
-use super::stored::StoredTensor;
 use crate::error::{Error, Result};
+use crate::formats::StoredTensor;
+use crate::formats::pth::shown;
 use crate::tensor::{Float, Tensor};
 
 /// A tensor of a file, and which parameter it is meant for.

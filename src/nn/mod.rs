@@ -1,12 +1,9 @@
-//! Parameters by path, the modules that use them, initialisation, and files of weights.
-//!
-//! [`TensorFile`] opens any file of named tensors ([`checkpoint`]: safetensors, [`pth`]: PyTorch's own, [`npz`]: NumPy's);
-//! [`fit`] compares what is in it with a model's parameters.
+//! Parameters by path, the modules that use them, initialisation, and whether a file of weights fits a model.
 //!
 //! A module is plain data: its sizes and the [`ParamId`]s of its parameters. The numbers live in [`Params`], under the
-//! names of the public checkpoints; a [`Context`] brings both together for one forward pass.
+//! names of the public checkpoints; a [`Context`] brings both together for one forward pass. [`fit`] compares what is in
+//! a [file of tensors](crate::formats) with a model's parameters.
 
-pub mod checkpoint;
 mod context;
 mod conv;
 mod fit;
@@ -14,11 +11,7 @@ mod fold;
 mod init;
 mod linear;
 mod norm;
-pub mod npz;
 mod params;
-pub mod pth;
-mod stored;
-mod tensor_file;
 
 pub use context::Context;
 pub use conv::{Conv, ConvBn, ConvStart, DepthwiseConv, Joined, Normalised};
@@ -28,5 +21,3 @@ pub use init::{Init, Start};
 pub use linear::Linear;
 pub use norm::{BatchNorm, LayerNorm};
 pub use params::{Builder, Layout, Param, ParamId, Params};
-pub use stored::{Dtype, StoredTensor};
-pub use tensor_file::TensorFile;

@@ -1,7 +1,7 @@
 //! Normalisations as modules.
 
 use super::{Builder, Context, Init, Layout, ParamId};
-use crate::ops::batch_norm::Activation;
+use crate::ops::normalise::batch_norm::Activation;
 use crate::tensor::{Float, Tensor, Var};
 
 /// Batch normalisation (Ioffe and Szegedy, 1502.03167) over all but the channels, with an activation behind it.

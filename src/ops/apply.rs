@@ -3,7 +3,8 @@
 use std::time::Duration;
 
 use super::op::{Needs, Op};
-use crate::tensor::trace::{self, Entry, Work};
+use crate::tensor::profile;
+use crate::tensor::profile::{Entry, Work};
 use crate::tensor::{Float, GradSink, Shape, Tape, Tensor, Upstream, Var};
 
 /// Runs an op with one output (auxiliary ones are dropped).
@@ -30,9 +31,9 @@ pub fn apply<T: Float, O: Op<T>>(op: O, inputs: &[&Var<T>]) -> Vec<Var<T>> {
     let needs = Needs(inputs.iter().map(|v| v.is_tracked()).collect());
     let values: Vec<&Tensor<T>> = inputs.iter().map(|v| v.value()).collect();
 
-    let running = trace::begin_forward(|| entry::<T, O>(&op, &shapes, &expected, &needs));
+    let running = profile::begin_forward(|| entry::<T, O>(&op, &shapes, &expected, &needs));
     let (mut outputs, saved) = op.forward(&values, &needs);
-    let place = trace::end_forward(running, &outputs);
+    let place = profile::end_forward(running, &outputs);
 
     debug_assert!(outputs.iter().map(Tensor::shape).eq(&expected), "{}: the shape rule says {expected:?}", O::NAME);
     let auxiliary = outputs.split_off(outputs.len() - op.auxiliary());
@@ -41,9 +42,9 @@ pub fn apply<T: Float, O: Op<T>>(op: O, inputs: &[&Var<T>]) -> Vec<Var<T>> {
         Some(tape) => {
             let slots = inputs.iter().map(|v| v.slot()).collect();
             let backward = move |upstream: Upstream<T>, sink: &mut GradSink<'_, T>| {
-                let running = trace::begin_backward(place);
+                let running = profile::begin_backward(place);
                 op.backward(saved, upstream, sink);
-                trace::end_backward(running);
+                profile::end_backward(running);
             };
             tape.record(slots, outputs, Box::new(backward))
         }

@@ -2,9 +2,18 @@
 
 use std::any::Any;
 
+use super::attention::{factorised, relative_position};
 use super::case::{Case, Input};
+use super::conv::{conv2d, depthwise, transpose, upsampled};
+use super::depth::{disparity_to_depth, min_reprojection, photometric, pose, rotation, smoothness, ssim, warp};
+use super::elementwise::{activation, binary, dropout, pow, select, unary};
+use super::image::{grid_sample, pool2d, reflect_pad, resize_bilinear, upsample_nearest};
+use super::movement::{concat, flip, gather, index_select, repeat, scatter_add, shape_ops, slice, sort, top_k};
+use super::normalise::{batch_norm, layer_norm};
 use super::op::{Op, Registered};
-use super::*;
+use super::product::{cross, linear, matmul};
+use super::reduce::{cross_entropy, cumulative, log_softmax, log_sum_exp, norm, prod, softmax, sum, variance};
+use super::{ShapeError, apply};
 use crate::tensor::{Shape, Var};
 
 /// Makes the list of all ops and, in the same breath, lets each of them be an [`Op`].
@@ -42,28 +51,28 @@ registry! {
     "div" => binary::Binary<binary::Div>,
     "maximum" => binary::Binary<binary::Maximum>,
     "minimum" => binary::Binary<binary::Minimum>,
-    "sum" => reduce::Sum,
-    "max" => reduce::Extreme<reduce::Max>,
-    "min" => reduce::Extreme<reduce::Min>,
+    "sum" => sum::Sum,
+    "max" => sum::Extreme<sum::Max>,
+    "min" => sum::Extreme<sum::Min>,
     "reshape" => shape_ops::Reshape,
     "permute" => shape_ops::Permute,
     "matmul" => matmul::Matmul,
     "linear" => linear::Linear,
     "conv2d" => conv2d::Conv2d,
     "concat" => concat::Concat,
-    "depthwise_conv2d" => depthwise_conv2d::DepthwiseConv2d,
+    "depthwise_conv2d" => depthwise::DepthwiseConv2d,
     "max_pool2d" => pool2d::MaxPool2d,
     "avg_pool2d" => pool2d::AvgPool2d,
     "resize_bilinear" => resize_bilinear::ResizeBilinear,
     "reflect_pad" => reflect_pad::ReflectPad,
     "slice" => slice::Slice,
     "upsample_nearest" => upsample_nearest::UpsampleNearest,
-    "upsampled_conv2d" => upsampled_conv2d::UpsampledConv2d,
+    "upsampled_conv2d" => upsampled::UpsampledConv2d,
     "batch_norm" => batch_norm::BatchNorm,
     "batch_norm_eval" => batch_norm::BatchNormEval,
     "layer_norm" => layer_norm::LayerNorm,
     "softmax" => softmax::Softmax,
-    "factorised_attention" => factorised_attention::FactorisedAttention,
+    "factorised_attention" => factorised::FactorisedAttention,
     "axis_angle_to_rotation" => rotation::AxisAngleToRotation,
     "grid_sample" => grid_sample::GridSample,
     "warp" => warp::Warp,
@@ -72,14 +81,14 @@ registry! {
     "smoothness" => smoothness::Smoothness,
     "min_reprojection" => min_reprojection::MinReprojection,
     "pose_matrix" => pose::PoseMatrix,
-    "conv_relative_position" => conv_relative_position::ConvRelativePosition,
+    "conv_relative_position" => relative_position::ConvRelativePosition,
     "index_select" => index_select::IndexSelect,
     "gather" => gather::Gather,
     "scatter_add" => scatter_add::ScatterAdd,
     "sort" => sort::Sort,
     "top_k" => top_k::TopK,
     "dropout" => dropout::Dropout,
-    "conv_transpose2d" => conv_transpose2d::ConvTranspose2d,
+    "conv_transpose2d" => transpose::ConvTranspose2d,
     "cross" => cross::Cross,
     "repeat" => repeat::Repeat,
     "flip" => flip::Flip,

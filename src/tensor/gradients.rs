@@ -3,9 +3,9 @@
 use super::data::Tensor;
 use super::float::Float;
 use super::gemm::Accum;
+use super::profile;
 use super::shape::Shape;
 use super::tape::Tape;
-use super::trace;
 use super::var::Var;
 
 /// The gradients of a node's outputs; `None` for an output that nothing depends on.
@@ -56,7 +56,7 @@ impl<'a, T: Float> GradSink<'a, T> {
         let Some(slot) = self.inputs[i] else { return };
         assert_eq!(*gradient.shape(), self.shapes[slot], "a gradient has the shape of its input");
         match &mut self.slots[slot] {
-            Some(sum) => trace::phase("gradient accumulation", || sum.add_assign(&gradient)),
+            Some(sum) => profile::phase("gradient accumulation", || sum.add_assign(&gradient)),
             empty => *empty = Some(gradient),
         }
     }

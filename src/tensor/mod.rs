@@ -13,7 +13,7 @@
 //! | `register_tile` | products whose operands stay where they lie: convolutions, linear layers |
 //! | [`parallel`] | threads, with the same bits for any number of them |
 //! | [`simd`] | run-time choice of instruction set |
-//! | [`trace`] | what ran, and how long |
+//! | [`profile`] | what ran, and how long |
 
 mod data;
 pub mod float;
@@ -22,11 +22,11 @@ pub mod gemm_small;
 pub mod gradients;
 pub mod parallel;
 pub mod pool;
+pub mod profile;
 pub(crate) mod register_tile;
 pub mod shape;
 pub mod simd;
 pub mod tape;
-pub mod trace;
 pub mod var;
 
 pub use data::Tensor;

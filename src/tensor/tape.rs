@@ -9,8 +9,8 @@ use std::rc::Rc;
 use super::data::Tensor;
 use super::float::Float;
 use super::gradients::{GradSink, Gradients, Upstream};
+use super::profile;
 use super::shape::Shape;
-use super::trace;
 use super::var::Var;
 
 /// What a node does in the backward pass: turns the gradients of its outputs into those of its inputs.
@@ -130,7 +130,7 @@ impl<T: Float> Tape<T> {
                 empty => *empty = Some(cotangent.clone()),
             }
         }
-        trace::phase("tape", || {
+        profile::phase("tape", || {
             while let Some(node) = nodes.pop() {
                 let upstream: Vec<_> = node.outputs.iter().map(|&slot| slots[slot].take()).collect();
                 if upstream.iter().any(Option::is_some) {

@@ -4,12 +4,14 @@
 use std::collections::BTreeSet;
 
 use parallax::data::batch::{Augment, Batch, batch_of_step};
-use parallax::data::street::{Street, StreetConfig};
 use parallax::monovit::loss::{LossConfig, Reprojection, Scales};
-use parallax::monovit::run::RunConfig;
-use parallax::monovit::{Ablation, MonoVit, Preset, Trainer};
+use parallax::monovit::{Ablation, MonoVit, Preset};
 use parallax::nn::Params;
-use parallax::ops::{registry, trace};
+use parallax::ops::registry;
+use parallax::street::{Street, StreetConfig};
+use parallax::tensor::profile;
+use parallax::train::Trainer;
+use parallax::train::run::RunConfig;
 
 use super::whole_model::assert_taylor;
 
@@ -29,7 +31,7 @@ fn step(ablation: Ablation, change: impl FnOnce(&mut LossConfig)) -> [Params<f32
     let mut trainer = Trainer::new(config.model(), config.optim, config.loss, 0);
     let before = trainer.params.clone();
     let batch = batch();
-    let (report, entries) = trace::record(false, || trainer.step(&batch));
+    let (report, entries) = profile::record(false, || trainer.step(&batch));
     let report = report.expect("a step");
     assert!(report.loss.is_finite() && report.grad_norm > 0.0, "{report:?}");
     let checked: BTreeSet<(&str, &str)> =
@@ -119,7 +121,7 @@ fn without_ssim_it_is_not_computed() {
         let mut config = RunConfig::new(Preset::Pico, 10);
         config.loss.ssim = ssim;
         let mut trainer = Trainer::new(config.model(), config.optim, config.loss, 0);
-        let (_, entries) = trace::record(false, || trainer.step(&batch));
+        let (_, entries) = profile::record(false, || trainer.step(&batch));
         let photometric: BTreeSet<_> = entries.iter().filter(|e| e.op == "photometric").map(|e| e.algo).collect();
         assert_eq!(photometric, BTreeSet::from([path]));
     }

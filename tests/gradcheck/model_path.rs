@@ -3,13 +3,15 @@
 use std::collections::BTreeSet;
 
 use parallax::data::batch::{Augment, batch_of_step};
-use parallax::data::street::{Street, StreetConfig};
-use parallax::monovit::evaluation::Predictor;
-use parallax::monovit::run::RunConfig;
-use parallax::monovit::{Preset, Trainer};
+use parallax::eval::predictor::Predictor;
+use parallax::monovit::Preset;
 use parallax::nn::Params;
-use parallax::ops::{registry, trace};
+use parallax::ops::registry;
+use parallax::street::{Street, StreetConfig};
 use parallax::tensor::parallel;
+use parallax::tensor::profile;
+use parallax::train::Trainer;
+use parallax::train::run::RunConfig;
 
 fn street(height: usize, width: usize) -> Street {
     Street::render(&StreetConfig { height, width, sequences: 1, frames: 6, ..StreetConfig::default() }, None)
@@ -23,16 +25,16 @@ fn paths(preset: Preset, height: usize, width: usize, batch: usize) -> BTreeSet<
     config.loss.shake.steps = 1;
     let mut trainer = Trainer::new(config.model(), config.optim, config.loss, 0);
     let batch = batch_of_step(&street, Augment::default(), batch, 0, 0).expect("a batch");
-    let (step, mut entries) = trace::record(false, || trainer.step(&batch));
+    let (step, mut entries) = profile::record(false, || trainer.step(&batch));
     step.expect("a step");
     let lesson = || trainer.learn_rotations(|| Ok(batch.clone()), |_, _| true);
-    let (learnt, more) = trace::record(false, lesson);
+    let (learnt, more) = profile::record(false, lesson);
     assert!(learnt.expect("a lesson"));
     entries.extend(more);
     let image = street.frame(0, 1).clone();
     let predictor = Predictor::new(&trainer.model, &trainer.params, &config.loss);
-    entries.extend(trace::record(false, || predictor.disparity(&image)).1);
-    entries.extend(trace::record(false, || predictor.inverse_depth(&image, true)).1);
+    entries.extend(profile::record(false, || predictor.disparity(&image)).1);
+    entries.extend(profile::record(false, || predictor.inverse_depth(&image, true)).1);
     entries.iter().map(|e| (e.op, e.algo)).collect()
 }
 

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use parallax::gradcheck::{Kinks, Options, check, draw};
 use parallax::ops::Conv2d;
 use parallax::ops::case::{Fill, Input};
-use parallax::ops::conv_transpose2d::ConvTranspose2d;
+use parallax::ops::conv::transpose::ConvTranspose2d;
 use parallax::ops::registry::{self, AnyCase};
 use parallax::random::Random;
 use parallax::tensor::{Shape, Tape, Tensor, Var};
@@ -166,7 +166,7 @@ proptest! {
 
     #[test]
     fn places_on_and_beyond_the_border(x in -2.5f64..2.5, y in -2.5f64..2.5, align in any::<bool>(), size in pair(1, 4)) {
-        use parallax::ops::grid_sample::GridPadding;
+        use parallax::ops::image::grid_sample::GridPadding;
         let grid = Tensor::from_vec([1, 1, 1, 2], vec![x, y]);
         for padding in [GridPadding::Zeros, GridPadding::Border, GridPadding::Reflection] {
             let image = distinct([1, size[0], size[1], 1], 1);

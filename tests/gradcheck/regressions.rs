@@ -4,9 +4,9 @@
 
 use parallax::gradcheck::{Kinks, Options, check};
 use parallax::ops::Conv2d;
-use parallax::ops::batch_norm::Activation;
-use parallax::ops::conv_transpose2d::ConvTranspose2d;
-use parallax::ops::grid_sample::GridPadding;
+use parallax::ops::conv::transpose::ConvTranspose2d;
+use parallax::ops::image::grid_sample::GridPadding;
+use parallax::ops::normalise::batch_norm::Activation;
 use parallax::optim::clip_norm;
 use parallax::random::Random;
 use parallax::tensor::{Shape, Tape, Tensor, Var};

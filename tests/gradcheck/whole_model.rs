@@ -1,11 +1,11 @@
 //! The whole of a small MonoViT and its loss, in f64: by the slope of the Taylor remainder along random directions.
 
 use parallax::data::batch::{Augment, Batch, batch_of_step};
-use parallax::data::street::{Street, StreetConfig};
 use parallax::monovit::loss::{LossConfig, Views, loss};
 use parallax::monovit::{Config, MonoVit, Preset};
 use parallax::nn::{Context, Params};
 use parallax::random::Random;
+use parallax::street::{Street, StreetConfig};
 use parallax::tensor::{Tape, Tensor, Var};
 
 fn total(

@@ -1,8 +1,8 @@
 //! Every op against PyTorch: values and every gradient, to 1e-10.
 
 use parallax::ops::Conv2d;
-use parallax::ops::batch_norm::Activation;
-use parallax::ops::grid_sample::GridPadding;
+use parallax::ops::image::grid_sample::GridPadding;
+use parallax::ops::normalise::batch_norm::Activation;
 use parallax::tensor::{Tape, Var};
 use safetensors::SafeTensors;
 use serde_json::Value;

@@ -5,9 +5,10 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use parallax::formats::{TensorFile, safetensors};
 use parallax::monovit::loss::{Loss, LossConfig, Views, loss};
 use parallax::monovit::{MonoVit, Preset};
-use parallax::nn::{Context, Folded, Named, Params, TensorFile, checkpoint, fit};
+use parallax::nn::{Context, Folded, Named, Params, fit};
 use parallax::optim::{AdamW, Group};
 use parallax::random::Random;
 use parallax::tensor::{Float, Tape, Tensor, Var};
@@ -20,7 +21,7 @@ struct Reference<T: Float>(HashMap<String, Tensor<T>>);
 
 impl<T: Float> Reference<T> {
     fn read() -> Self {
-        Reference(checkpoint::read(&fixture()).expect("the fixture").tensors)
+        Reference(safetensors::read(&fixture()).expect("the fixture").tensors)
     }
 
     fn get(&self, name: &str) -> &Tensor<T> {

@@ -4,8 +4,9 @@
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
+use parallax::formats::safetensors;
 use parallax::monovit::{MonoVit, Preset};
-use parallax::nn::{Context, Folded, Params, checkpoint};
+use parallax::nn::{Context, Folded, Params};
 use parallax::tensor::{Shape, Tensor, Var};
 
 fn fixture(name: &str) -> PathBuf {
@@ -79,7 +80,7 @@ fn check(preset: Preset) {
         let ours = p.layout.import(&theirs).expect("a layout that fits");
         params.set(id, ours);
     }
-    let reference = checkpoint::read::<f64>(&fixture("published.safetensors")).expect("the fixture").tensors;
+    let reference = safetensors::read::<f64>(&fixture("published.safetensors")).expect("the fixture").tensors;
     let c = Context::inference(&params);
     let features = model.features(&c, &input("input"));
     for (i, feature) in features.iter().enumerate() {

@@ -4,13 +4,14 @@ use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;
 
+use parallax::formats::{TensorFile, safetensors};
 use parallax::monovit::loss::{LossConfig, Views, loss};
-use parallax::monovit::run::check_size;
 use parallax::monovit::{Config, MonoVit, Preset};
-use parallax::nn::{Context, Folded, Named, TensorFile, checkpoint, fit};
+use parallax::nn::{Context, Folded, Named, fit};
 use parallax::ops::Conv2d;
 use parallax::random::Random;
 use parallax::tensor::{Tape, Tensor, Var};
+use parallax::train::run::check_size;
 use parallax::{Error, Result};
 use serde::Serialize;
 
@@ -64,7 +65,7 @@ impl Theirs<'_> {
 }
 
 pub fn run(path: &Path) -> Result<()> {
-    let contents = checkpoint::read::<f32>(path)?;
+    let contents = safetensors::read::<f32>(path)?;
     let named = contents.metadata.get("preset").and_then(|name| Preset::ALL.into_iter().find(|p| p.name() == name));
     let preset = named.ok_or_else(|| Error::file(path, "the metadata names no preset"))?;
     let theirs = Theirs { tensors: contents.tensors, path };

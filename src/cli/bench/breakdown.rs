@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use parallax::tensor::trace::Profile;
+use parallax::tensor::profile::Profile;
 use serde::Serialize;
 
 /// One op on one kernel path, or something that is no op (without a kernel path); of one iteration.
@@ -85,7 +85,7 @@ mod tests {
     use std::time::Duration;
 
     use parallax::monovit::Preset;
-    use parallax::tensor::trace;
+    use parallax::tensor::profile;
 
     use super::*;
     use crate::cli::bench::job::{Job, Network, measure};
@@ -97,7 +97,7 @@ mod tests {
     fn the_rows_of_a_training_step_add_up_to_the_traced_total() {
         let mut network = Network::new(&PICO, true).expect("sizes that fit");
         let profiles = [(); 2].map(|()| {
-            let (done, profile) = trace::profile(|| network.once());
+            let (done, profile) = profile::profile(|| network.once());
             done.expect("a step");
             profile
         });

@@ -4,13 +4,14 @@ use std::time::Instant;
 
 use parallax::Result;
 use parallax::data::batch::Batch;
-use parallax::monovit::Trainer;
-use parallax::monovit::run::RunConfig;
 use parallax::nn::Folded;
 use parallax::ops::Conv2d;
 use parallax::random::Random;
-use parallax::tensor::trace::{self, Profile};
+use parallax::tensor::profile;
+use parallax::tensor::profile::Profile;
 use parallax::tensor::{Shape, Tensor, Var, pool};
+use parallax::train::Trainer;
+use parallax::train::run::RunConfig;
 
 use super::Sizes;
 
@@ -34,7 +35,7 @@ pub struct Measured {
 
 /// Times a job, after three times that are not counted; `listen` for the profiles too.
 pub fn measure(job: &mut impl Job, iterations: usize, listen: bool) -> Result<Measured> {
-    let (done, warm) = trace::profile(|| job.once());
+    let (done, warm) = profile::profile(|| job.once());
     done?;
     job.once()?;
     job.once()?;
@@ -47,7 +48,7 @@ pub fn measure(job: &mut impl Job, iterations: usize, listen: bool) -> Result<Me
         seconds.push(start.elapsed().as_secs_f64());
         fresh += pool::fresh_buffers() - before;
         if listen {
-            let (done, profile) = trace::profile(|| job.once());
+            let (done, profile) = profile::profile(|| job.once());
             done?;
             profiles.push(profile);
         }

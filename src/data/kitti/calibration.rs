@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::Side;
-use crate::data::Intrinsics;
+use crate::camera::Intrinsics;
 use crate::{Error, Result};
 
 const CAMERAS: &str = "calib_cam_to_cam.txt";

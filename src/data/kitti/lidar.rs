@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use crate::data::DepthMap;
+use crate::depth::DepthMap;
 use crate::{Error, Result};
 
 /// What a point's depth is.

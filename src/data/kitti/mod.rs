@@ -10,7 +10,6 @@
 //! Whatever can be wrong with a data set is found by [`Kitti::open`], before any time is spent on training.
 
 mod calibration;
-mod depth_png;
 mod lidar;
 mod scan;
 mod split;
@@ -21,14 +20,16 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use image::RgbImage;
 
+use crate::formats::depth_png::read_depth_png;
 pub use calibration::Calibration;
-pub use depth_png::read_depth_png;
 pub use lidar::{DepthAxis, project_scan, read_scan};
 pub use split::{Side, SplitLine, read_split};
 
+use super::Dataset;
 use super::picture::{check_picture, read_picture};
 use super::resize::lanczos;
-use super::{Dataset, DepthMap, Intrinsics};
+use crate::camera::Intrinsics;
+use crate::depth::DepthMap;
 use crate::{Error, Result};
 
 /// Whose intrinsics the samples carry.

@@ -5,7 +5,7 @@ use std::fs;
 use image::Rgb;
 
 use super::*;
-use crate::report::depth_png::write_depth_png;
+use crate::formats::depth_png::write_depth_png;
 use crate::test_support::{fixture_bytes, kitti};
 
 /// Writes a drive `day/drive` with frames `numbers` of both cameras, 24x16.

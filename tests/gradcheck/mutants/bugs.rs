@@ -1,25 +1,25 @@
 //! The planted bugs, by class. Where one was found in the wild, its line says where; the catalogue has the links.
 
-use parallax::ops::activation::LeakyRelu;
-use parallax::ops::batch_norm::BatchNorm;
-use parallax::ops::concat::Concat;
-use parallax::ops::conv_transpose2d::ConvTranspose2d;
-use parallax::ops::cumulative::CumSum;
-use parallax::ops::dropout::Dropout;
-use parallax::ops::grid_sample::{GridPadding, GridSample};
-use parallax::ops::index_select::IndexSelect;
-use parallax::ops::layer_norm::LayerNorm;
-use parallax::ops::norm::L2Normalize;
-use parallax::ops::pool2d::{AvgPool2d, MaxPool2d};
-use parallax::ops::reduce::{Extreme, Max, Sum};
-use parallax::ops::reflect_pad::ReflectPad;
-use parallax::ops::repeat::Repeat;
-use parallax::ops::shape_ops::Permute;
-use parallax::ops::slice::Slice;
-use parallax::ops::softmax::Softmax;
-use parallax::ops::unary::Unary;
-use parallax::ops::upsampled_conv2d::UpsampledConv2d;
-use parallax::ops::variance::Variance;
+use parallax::ops::conv::transpose::ConvTranspose2d;
+use parallax::ops::conv::upsampled::UpsampledConv2d;
+use parallax::ops::elementwise::activation::LeakyRelu;
+use parallax::ops::elementwise::dropout::Dropout;
+use parallax::ops::elementwise::unary::Unary;
+use parallax::ops::image::grid_sample::{GridPadding, GridSample};
+use parallax::ops::image::pool2d::{AvgPool2d, MaxPool2d};
+use parallax::ops::image::reflect_pad::ReflectPad;
+use parallax::ops::movement::concat::Concat;
+use parallax::ops::movement::index_select::IndexSelect;
+use parallax::ops::movement::repeat::Repeat;
+use parallax::ops::movement::shape_ops::Permute;
+use parallax::ops::movement::slice::Slice;
+use parallax::ops::normalise::batch_norm::BatchNorm;
+use parallax::ops::normalise::layer_norm::LayerNorm;
+use parallax::ops::reduce::cumulative::CumSum;
+use parallax::ops::reduce::norm::L2Normalize;
+use parallax::ops::reduce::softmax::Softmax;
+use parallax::ops::reduce::sum::{Extreme, Max, Sum};
+use parallax::ops::reduce::variance::Variance;
 use parallax::ops::{Conv2d, apply};
 use parallax::tensor::{Shape, Tensor, Var, parallel};
 

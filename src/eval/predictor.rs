@@ -1,0 +1,99 @@
+//! Depth of pictures, and how good it is against ground truth.
+
+use super::metrics::{MeanMap, Protocol, Report, Scale, evaluate_image, flip_post_process, mirror};
+use crate::data::Dataset;
+use crate::data::augment::flip;
+use crate::data::batch::to_tensor;
+use crate::error::{Error, Result};
+use crate::monovit::MonoVit;
+use crate::monovit::loss::LossConfig;
+use crate::nn::{Folded, Params};
+use image::RgbImage;
+
+/// How to predict and to compare.
+#[derive(Clone, Copy, Debug)]
+pub struct Evaluation {
+    /// Which pixels, which ground truth.
+    pub protocol: Protocol,
+    /// How a prediction gets its scale.
+    pub scale: Scale,
+    /// Whether to predict on the mirrored picture too, and to join both (Monodepth's post-processing).
+    pub flip: bool,
+}
+
+/// A predictor: the networks with weights in evaluation mode.
+pub struct Predictor<'a> {
+    model: &'a MonoVit,
+    params: Folded<f32>,
+    nearest: f32,
+    farthest: f32,
+}
+
+impl<'a> Predictor<'a> {
+    /// The networks with these weights; `config` gives the range of depths.
+    pub fn new(model: &'a MonoVit, params: &Params<f32>, config: &LossConfig) -> Self {
+        let (nearest, farthest) = (config.min_depth as f32, config.max_depth as f32);
+        Predictor { model, params: Folded::new(params), nearest, farthest }
+    }
+
+    /// Sigmoid disparity of a picture whose sides are multiples of 32, row-major.
+    pub fn disparity(&self, image: &RgbImage) -> Vec<f32> {
+        self.model.predict(&self.params, &to_tensor(&[image])).swap_remove(0).data().to_vec()
+    }
+
+    /// Inverse depth (up to scale) of a picture: `1/max + (1/min - 1/max) disparity`.
+    pub fn inverse_depth(&self, image: &RgbImage, flipped_too: bool) -> Vec<f32> {
+        let (near, far) = (1.0 / self.nearest, 1.0 / self.farthest);
+        let scaled = |d: Vec<f32>| -> Vec<f32> { d.into_iter().map(|d| far + (near - far) * d).collect() };
+        if !flipped_too {
+            return scaled(self.disparity(image));
+        }
+        let width = image.width() as usize;
+        let both = self.model.predict(&self.params, &to_tensor(&[image, &flip(image)])).swap_remove(0);
+        let (plain, mirrored) = both.data().split_at(both.len() / 2);
+        let mirrored = mirror(&scaled(mirrored.to_vec()), width);
+        flip_post_process(&scaled(plain.to_vec()), &mirrored, width)
+    }
+}
+
+/// The seven metrics of a network on a data set; `seen` is told how many samples are done.
+///
+/// # Errors
+/// If a sample has no ground truth, or cannot be read.
+pub fn evaluate(
+    predictor: &Predictor,
+    data: &dyn Dataset,
+    samples: &[usize],
+    how: Evaluation,
+    mut seen: impl FnMut(usize),
+) -> Result<Report> {
+    let mut results = Vec::new();
+    for (i, &sample) in samples.iter().enumerate() {
+        let image = data.image(sample, 0)?;
+        let prediction = predictor.inverse_depth(&image, how.flip);
+        results.push(compare(data, sample, &prediction, (image.height() as usize, image.width() as usize), how)?);
+        seen(i + 1);
+    }
+    Report::new(results)
+}
+
+/// The seven metrics of the mean depth map on a data set.
+pub fn evaluate_mean_map(map: &MeanMap, data: &dyn Dataset, samples: &[usize], how: Evaluation) -> Result<Report> {
+    let results: Result<Vec<_>> =
+        samples.iter().map(|&sample| compare(data, sample, &map.inverse_depth, map.size, how)).collect();
+    Report::new(results?)
+}
+
+fn compare(
+    data: &dyn Dataset,
+    sample: usize,
+    inverse_depth: &[f32],
+    size: (usize, usize),
+    how: Evaluation,
+) -> Result<(String, super::metrics::ImageMetrics)> {
+    let name = data.name(sample);
+    let truth = data.depth(sample)?;
+    let truth = truth.ok_or_else(|| Error::Failed(format!("{name}: no ground-truth depth to compare with")))?;
+    let found = evaluate_image(inverse_depth, size, &truth, how.protocol, how.scale)?;
+    Ok((name, found))
+}

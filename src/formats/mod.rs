@@ -1,0 +1,25 @@
+//! Files: whole or not at all, never larger in memory than they are, never run.
+//!
+//! | module | format |
+//! |---|---|
+//! | [`atomic`] | how every file is written: aside, then renamed |
+//! | [`safetensors`] | named tensors, the crate's own checkpoints |
+//! | [`pth`] | named tensors in PyTorch's pickles, read as data |
+//! | [`npz`], [`npy`] | NumPy's archives and arrays |
+//! | [`depth_png`] | depth as KITTI stores it |
+//! | [`ply`] | coloured point clouds |
+//!
+//! [`TensorFile`] opens any file of named tensors.
+
+pub mod atomic;
+pub mod depth_png;
+pub mod npy;
+pub mod npz;
+pub mod ply;
+pub mod pth;
+pub mod safetensors;
+mod stored;
+mod tensor_file;
+
+pub use stored::{Dtype, StoredTensor};
+pub use tensor_file::TensorFile;

@@ -1,0 +1,72 @@
+//! The allow-list: every Python name a pickle may mention. Each stands for something that is made here; none is run.
+
+use super::{PthError, shown};
+use crate::formats::stored::Dtype;
+
+/// Every name a pickle may mention, and what it stands for here.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Global {
+    OrderedDict,
+    /// Settings of a training script (DeiT and its descendants save them): no more than a dictionary.
+    Namespace,
+    Size,
+    Device,
+    /// `_codecs.encode`: bytes in protocol 2.
+    Encode,
+    RebuildTensor,
+    RebuildTensorV2,
+    RebuildParameter,
+    Parameter,
+    Storage(Dtype),
+    TensorClass,
+    /// A dtype that is stored as a value, `torch.float32`.
+    DtypeValue(Dtype),
+}
+
+/// The allow-list. Whatever is not here is refused by name.
+pub(super) fn global(module: &str, name: &str) -> Result<Global, PthError> {
+    let known = match (module, name) {
+        ("collections", "OrderedDict") => Some(Global::OrderedDict),
+        ("argparse", "Namespace") => Some(Global::Namespace),
+        ("torch", "Size") => Some(Global::Size),
+        ("torch", "device") => Some(Global::Device),
+        ("_codecs", "encode") => Some(Global::Encode),
+        ("torch._utils", "_rebuild_tensor") => Some(Global::RebuildTensor),
+        ("torch._utils", "_rebuild_tensor_v2") => Some(Global::RebuildTensorV2),
+        ("torch._utils", "_rebuild_parameter") => Some(Global::RebuildParameter),
+        ("torch.nn.parameter", "Parameter") => Some(Global::Parameter),
+        ("torch" | "torch.cuda", _) => {
+            if let Some(dtype) = name.strip_suffix("Storage").and_then(class_dtype) {
+                Some(Global::Storage(dtype))
+            } else if name.strip_suffix("Tensor").and_then(class_dtype).is_some() {
+                Some(Global::TensorClass)
+            } else {
+                dtype_by_name(name).map(Global::DtypeValue)
+            }
+        }
+        _ => None,
+    };
+    known.ok_or_else(|| PthError::Refused(shown(&format!("{module}.{name}"))))
+}
+
+/// The number in `FloatStorage` or `FloatTensor`.
+fn class_dtype(class: &str) -> Option<Dtype> {
+    Some(match class {
+        "Double" => Dtype::F64,
+        "Float" => Dtype::F32,
+        "Half" => Dtype::F16,
+        "BFloat16" => Dtype::BF16,
+        "Long" => Dtype::I64,
+        "Int" => Dtype::I32,
+        "Short" => Dtype::I16,
+        "Char" => Dtype::I8,
+        "Byte" => Dtype::U8,
+        "Bool" => Dtype::Bool,
+        _ => return None,
+    })
+}
+
+fn dtype_by_name(name: &str) -> Option<Dtype> {
+    use Dtype::*;
+    [F64, F32, F16, BF16, I64, I32, I16, I8, U8, Bool].into_iter().find(|d| d.name() == name)
+}

@@ -1,0 +1,156 @@
+//! Checkpoints as safetensors, in PyTorch's names and layouts, so that one file serves both sides.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+use std::sync::Arc;
+
+use safetensors::tensor::{Dtype, Metadata, TensorView, serialize};
+
+use super::pth::shown;
+use super::stored::{self, StoredTensor};
+use super::tensor_file::TensorFile;
+use crate::error::{Error, Result};
+use crate::nn::Params;
+use crate::tensor::{Float, Tensor};
+
+/// The largest file that is read, in bytes. The training state of the largest size has 2 GB.
+const MAX_FILE: u64 = 8 << 30;
+/// The longest header, in bytes. A tensor takes some 150.
+const MAX_HEADER: u64 = 8 << 20;
+
+/// The bytes of a checkpoint: every tensor under its own name, in PyTorch's layout, in f32, and `metadata`.
+pub fn to_bytes<T: Float>(tensors: &BTreeMap<String, Tensor<T>>, metadata: HashMap<String, String>) -> Result<Vec<u8>> {
+    let bytes: Vec<(&String, Vec<usize>, Vec<u8>)> = tensors
+        .iter()
+        .map(|(name, t)| {
+            let numbers = t.data().iter().flat_map(|x| (x.f64() as f32).to_le_bytes()).collect();
+            (name, t.dims().to_vec(), numbers)
+        })
+        .collect();
+    let views: Result<Vec<_>, _> = bytes
+        .iter()
+        .map(|(name, dims, numbers)| Ok((name.as_str(), TensorView::new(Dtype::F32, dims.clone(), numbers)?)))
+        .collect();
+    let failed = |e: safetensors::SafeTensorError| Error::Failed(format!("a checkpoint could not be written: {e}"));
+    serialize(views.map_err(failed)?, Some(metadata)).map_err(failed)
+}
+
+/// Writes a checkpoint, aside first and then in place.
+pub fn write<T: Float>(
+    path: &Path,
+    tensors: &BTreeMap<String, Tensor<T>>,
+    metadata: HashMap<String, String>,
+) -> Result<()> {
+    crate::formats::atomic::write_bytes_atomically(path, &to_bytes(tensors, metadata)?)
+}
+
+/// A model's tensors under their own names, in PyTorch's layout.
+pub fn export<T: Float>(params: &Params<T>) -> BTreeMap<String, Tensor<T>> {
+    params.iter().map(|(_, p)| (p.name().to_owned(), p.layout.export(&p.value))).collect()
+}
+
+/// Opens a safetensors file.
+///
+/// # Errors
+/// If the header does not describe the file exactly: every tensor a range of the length that its shape needs, no two
+/// overlapping, nothing left over. Nothing larger than the header is read before that is known.
+pub fn open(path: &Path) -> Result<TensorFile> {
+    let io = |e| Error::io(path, e);
+    let not = |why: String| Error::file(path, format!("not a safetensors file: {why}"));
+    let mut file = File::open(path).map_err(io)?;
+    let size = file.metadata().map_err(io)?.len();
+    if size > MAX_FILE {
+        return Err(Error::file(path, format!("has {size} bytes (at most {MAX_FILE} are read)")));
+    }
+    let mut length = [0; 8];
+    if size < 8 {
+        return Err(not(format!("it has {size} bytes and no header")));
+    }
+    file.read_exact(&mut length).map_err(io)?;
+    let length = u64::from_le_bytes(length);
+    if length > size - 8 {
+        return Err(not(format!("its header claims {length} bytes, of a file of {size}")));
+    }
+    if length > MAX_HEADER {
+        return Err(Error::file(path, format!("its header has {length} bytes (at most {MAX_HEADER} are read)")));
+    }
+    let mut header = Vec::new();
+    (&mut file).take(length).read_to_end(&mut header).map_err(io)?;
+    let header: Metadata =
+        serde_json::from_slice(&header).map_err(|e| Error::file(path, format!("its safetensors header: {e}")))?;
+    let claimed = header.data_len() as u64;
+    let there = size - 8 - length;
+    if there < claimed {
+        let message = format!("is cut short: {there} bytes of numbers, expected {claimed}. Copy or download it again");
+        return Err(Error::file(path, message));
+    }
+    if there > claimed {
+        return Err(Error::file(path, format!("is damaged: {} bytes belong to no tensor", there - claimed)));
+    }
+    let mut bytes = Vec::with_capacity(usize::try_from(claimed).unwrap_or(0));
+    file.take(claimed).read_to_end(&mut bytes).map_err(io)?;
+    let bytes = Arc::new(bytes);
+
+    let mut tensors = Vec::new();
+    for name in header.offset_keys() {
+        let Some(info) = header.info(&name) else { continue };
+        let Some(dtype) = dtype(info.dtype) else {
+            let message = format!("{} holds {:?}, which cannot be read", shown(&name), info.dtype);
+            return Err(Error::file(path, message));
+        };
+        let range = info.data_offsets.0..info.data_offsets.1;
+        let tensor = StoredTensor::contiguous(&bytes, range, dtype, info.shape.clone())
+            .ok_or_else(|| Error::file(path, format!("is damaged: {} goes beyond its end", shown(&name))))?;
+        tensors.push((name, tensor));
+    }
+    let metadata = header.metadata().clone().unwrap_or_default();
+    Ok(TensorFile { path: path.to_owned(), tensors, integers: Vec::new(), metadata })
+}
+
+fn dtype(theirs: Dtype) -> Option<stored::Dtype> {
+    Some(match theirs {
+        Dtype::F64 => stored::Dtype::F64,
+        Dtype::F32 => stored::Dtype::F32,
+        Dtype::F16 => stored::Dtype::F16,
+        Dtype::BF16 => stored::Dtype::BF16,
+        Dtype::I64 => stored::Dtype::I64,
+        Dtype::I32 => stored::Dtype::I32,
+        Dtype::I16 => stored::Dtype::I16,
+        Dtype::I8 => stored::Dtype::I8,
+        Dtype::U8 => stored::Dtype::U8,
+        Dtype::BOOL => stored::Dtype::Bool,
+        _ => return None,
+    })
+}
+
+/// What a safetensors file holds.
+pub struct Contents<T: Float> {
+    /// The tensors by name, in the file's layout.
+    pub tensors: HashMap<String, Tensor<T>>,
+    /// The file's metadata.
+    pub metadata: HashMap<String, String>,
+}
+
+/// Reads a whole safetensors file of floating-point tensors.
+///
+/// # Errors
+/// As [`open`]; and if a tensor holds integers, or has more dimensions than a tensor can.
+pub fn read<T: Float>(path: &Path) -> Result<Contents<T>> {
+    let file = open(path)?;
+    let mut tensors = HashMap::new();
+    for (name, stored) in file.tensors {
+        let rank = stored.shape().len();
+        if rank > crate::tensor::shape::MAX_RANK {
+            return Err(Error::file(path, format!("{} has {rank} dimensions, more than a tensor can", shown(&name))));
+        }
+        let numbers = stored.to_f64().ok_or_else(|| {
+            let found = stored.dtype().name();
+            Error::file(path, format!("{} holds {found}: floating point was expected", shown(&name)))
+        })?;
+        let numbers = numbers.into_iter().map(T::of).collect();
+        tensors.insert(name, Tensor::from_vec(stored.shape(), numbers));
+    }
+    Ok(Contents { tensors, metadata: file.metadata })
+}

@@ -1,0 +1,149 @@
+//! Nearest-neighbour enlargement by a whole factor.
+
+use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::tensor::simd::copy_run;
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+
+/// Every pixel of [batch, height, width, channels] becomes a square of `scale` x `scale` pixels.
+#[derive(Clone, Copy, Debug)]
+pub struct UpsampleNearest {
+    /// The factor.
+    pub scale: usize,
+}
+
+impl<T: Float> Op<T> for UpsampleNearest {
+    /// The shape of the input.
+    type Saved = Shape;
+
+    fn shape(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError> {
+        let Some([_, h, w, _]) = inputs[0].nhwc() else {
+            return Err(ShapeError::new("expected x [batch, height, width, channels]"));
+        };
+        if self.scale == 0 {
+            return Err(ShapeError::new("the scale must be at least 1"));
+        }
+        Ok(vec![inputs[0].with(1, h * self.scale).with(2, w * self.scale)])
+    }
+
+    fn algo(&self, _: &[Shape]) -> &'static str {
+        if self.scale == 2 { "by_2" } else { "direct" }
+    }
+
+    fn traffic(&self, inputs: &[Shape], outputs: &[Shape], needs: &Needs) -> [u64; 2] {
+        crate::ops::op::traffic_without_inputs(inputs, outputs, needs)
+    }
+
+    fn forward(&self, inputs: &[&Tensor<T>], _: &Needs) -> (Vec<Tensor<T>>, Shape) {
+        let (x, s) = (inputs[0], self.scale);
+        let [_, h, w, c] = x.shape().nhwc().expect("checked by the shape rule");
+        let shape = x.shape().with(1, h * s).with(2, w * s);
+        let y = Tensor::build(shape, |out| {
+            let work = out.len();
+            let row = w * s * c;
+            if work == 0 {
+                return;
+            }
+            // One row of the input becomes `scale` rows: the first is spread, the others are its copies.
+            parallel::for_each_chunk(out, s * row, work, |i, out| {
+                let (first, copies) = out.split_at_mut(row);
+                let x = &x.data()[i * w * c..][..w * c];
+                simd::dispatch(
+                    #[inline(always)]
+                    || {
+                        for (square, x) in first.chunks_exact_mut(s * c).zip(x.chunks_exact(c)) {
+                            square.chunks_exact_mut(c).for_each(|y| copy_run(y, x));
+                        }
+                    },
+                );
+                copies.chunks_exact_mut(row).for_each(|copy| copy.copy_from_slice(first));
+            });
+        });
+        (vec![y], *x.shape())
+    }
+
+    /// A pixel's gradient is the sum of those of its square.
+    fn backward(&self, shape: Shape, upstream: Upstream<T>, sink: &mut GradSink<T>) {
+        let (g, [_, _, w, c]) = (upstream.only(), shape.nhwc().expect("checked by the shape rule"));
+        sink.accumulate(0, |out, accum| sum_squares(out, accum, g.data(), [w, c], self.scale));
+    }
+}
+
+/// The sum of each square of `s` x `s` pixels of g, for an image of `w` squares a row with `c` channels.
+pub(in crate::ops) fn sum_squares<T: Float>(out: &mut [T], accum: Accum, g: &[T], [w, c]: [usize; 2], s: usize) {
+    let row = w * s * c;
+    if g.is_empty() {
+        return;
+    }
+    parallel::for_each_chunk(out, w * c, g.len(), |i, out| {
+        let g = &g[i * s * row..][..s * row];
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                if s == 2 {
+                    let (top, bottom) = g.split_at(row);
+                    return sum_pairs(out, accum, top, bottom, c);
+                }
+                if accum == Accum::Replace {
+                    out.fill(T::ZERO);
+                }
+                for g in g.chunks_exact(row) {
+                    for (d, g) in out.chunks_exact_mut(c).zip(g.chunks_exact(s * c)) {
+                        for g in g.chunks_exact(c) {
+                            d.iter_mut().zip(g).for_each(|(d, &g)| *d += g);
+                        }
+                    }
+                }
+            },
+        );
+    });
+}
+
+/// The sum of each square of 2 x 2 pixels of two rows.
+#[inline(always)]
+fn sum_pairs<T: Float>(out: &mut [T], accum: Accum, top: &[T], bottom: &[T], c: usize) {
+    for ((d, a), b) in out.chunks_exact_mut(c).zip(top.chunks_exact(2 * c)).zip(bottom.chunks_exact(2 * c)) {
+        let ((a0, a1), (b0, b1)) = (a.split_at(c), b.split_at(c));
+        let terms = d.iter_mut().zip(a0.iter().zip(a1)).zip(b0.iter().zip(b1));
+        match accum {
+            Accum::Replace => terms.for_each(|((d, (&a, &b)), (&e, &f))| *d = (a + b) + (e + f)),
+            Accum::Add => terms.for_each(|((d, (&a, &b)), (&e, &f))| *d += (a + b) + (e + f)),
+        }
+    }
+}
+
+impl Checked for UpsampleNearest {
+    fn cases() -> Vec<Case<Self>> {
+        let x = |shape: &[usize]| Input::random("x", shape);
+        let by = |scale| UpsampleNearest { scale };
+        vec![
+            Case::new("twice", by(2), [x(&[2, 3, 5, 8])]),
+            Case::new("twice, one channel", by(2), [x(&[2, 3, 5, 1])]),
+            Case::new("twice, 17 channels", by(2), [x(&[2, 1, 3, 17])]),
+            Case::new("three times", by(3), [x(&[2, 2, 3, 3])]),
+            Case::new("not at all", by(1), [x(&[2, 3, 2, 3])]),
+            Case::new("empty", by(2), [x(&[2, 0, 2, 3])]).flat(),
+        ]
+    }
+}
+
+impl<T: Float> Var<T> {
+    /// Enlarges [batch, height, width, channels] by a whole factor: every pixel becomes a square.
+    #[track_caller]
+    pub fn upsample_nearest(&self, scale: usize) -> Self {
+        apply1(UpsampleNearest { scale }, &[self])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pixels_become_squares() {
+        let x = Var::constant(Tensor::from_vec([1, 1, 2, 2], vec![1.0f32, 2.0, 3.0, 4.0]));
+        let y = x.upsample_nearest(2);
+        assert_eq!(y.shape().dims(), [1, 2, 4, 2]);
+        assert_eq!(y.value().data()[..8], [1.0, 2.0, 1.0, 2.0, 3.0, 4.0, 3.0, 4.0]);
+        assert_eq!(y.value().data()[8..], y.value().data()[..8]);
+    }
+}

@@ -1,0 +1,308 @@
+//! The linear layer: one product over all the rows of the batch.
+
+use crate::ops::elementwise::unary::{Function, Gelu};
+use crate::ops::support::epilogue::{Activation, Finish};
+use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::tensor::gemm::Rows;
+use crate::tensor::pool::Buffer;
+use crate::tensor::register_tile::{Gram, Line, Panels, Product};
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+
+/// `y [.., out] = x [.., in] w [in, out] (+ b [out])`. A 1x1 convolution is the same thing.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Linear {
+    /// Whether x passes through GELU on its way: `y = gelu(x) w + b`, as in the second half of a transformer's MLP.
+    /// gelu(x), the widest tensor of a block, is then computed tile by tile and again for the gradient, never kept.
+    pub gelu: bool,
+    /// Rows handed to a thread at a time; chosen by shape if 0. A gradient check shrinks it to reach tile edges.
+    pub tile: usize,
+}
+
+/// Rows a tile: about 2^17 multiplications, at least 40 rows; or `tile`, if that is given.
+fn tile_rows(tile: usize, k: usize, n: usize) -> usize {
+    if tile > 0 { tile } else { ((1 << 17) / (k * n).max(1)).clamp(40, 1000).next_multiple_of(20) }
+}
+
+/// `out = x w`, finished; x may come in parts, whose columns stand side by side.
+pub(in crate::ops) fn forward<T: Float>(out: &mut [T], parts: &[Rows<T>], w: &[T], finish: &Finish<T>, tile: usize) {
+    let k = parts.iter().map(|x| x.cols).sum();
+    let n = out.len() / parts[0].rows.max(1);
+    let tile = tile_rows(tile, k, n);
+    let work = 2 * out.len() * k;
+    let panels = Panels::dense(w, k, n, parts[0].rows);
+    parallel::for_each_chunk(out, tile * n, work, |i, out| {
+        let rows = out.len() / n;
+        let lines: Vec<Line<T>> = parts.iter().map(|x| line(x.rows(i * tile, rows))).collect();
+        Product { out, out_step: n, accum: Accum::Replace, lines: &lines, panels: &panels }.run();
+        finish.run(out);
+    });
+}
+
+/// `to = gelu(from)`.
+fn gelu<T: Float>(to: &mut [T], from: &[T]) {
+    simd::dispatch(
+        #[inline(always)]
+        || to.iter_mut().zip(from).for_each(|(t, &x)| *t = Gelu.f(x)),
+    );
+}
+
+/// The whole of gelu(x).
+fn apply_gelu<T: Float>(x: &Tensor<T>) -> Tensor<T> {
+    const CHUNK: usize = 1 << 14;
+    Tensor::build(*x.shape(), |out| {
+        let work = 16 * out.len();
+        parallel::for_each_chunk(out, CHUNK, work, |i, out| gelu(out, &x.data()[i * CHUNK..][..out.len()]));
+    })
+}
+
+/// `out = gelu(x) w`, finished; x has rows of k.
+fn forward_of_gelu<T: Float>(out: &mut [T], x: Rows<T>, w: &[T], finish: &Finish<T>, tile: usize) {
+    let k = x.cols;
+    let n = out.len() / x.rows.max(1);
+    let tile = tile_rows(tile, k, n);
+    let work = (2 * n + 16) * x.rows * k;
+    let panels = Panels::dense(w, k, n, x.rows);
+    parallel::for_each_chunk(out, tile * n, work, |i, out| {
+        let rows = out.len() / n;
+        let mut h = Buffer::stale(rows * k);
+        gelu(&mut h, &x.data[i * tile * k..][..rows * k]);
+        product(out, Accum::Replace, Rows::dense(&h, rows, k), &panels);
+        finish.run(out);
+    });
+}
+
+/// `dx = dy w^T gelu'(x)`.
+fn input_gradient_of_gelu<T: Float>(out: &mut [T], accum: Accum, x: &[T], dy: Rows<T>, w: &[T], tile: usize) {
+    let n = dy.cols;
+    let k = out.len() / dy.rows.max(1);
+    let tile = tile_rows(tile, k, n);
+    let work = (2 * n + 32) * out.len();
+    let panels = Panels::transposed(w, n, k);
+    parallel::for_each_chunk(out, tile * k, work, |i, out| {
+        let rows = out.len() / k;
+        let mut dh = Buffer::stale(out.len());
+        product(&mut dh, Accum::Replace, dy.rows(i * tile, rows), &panels);
+        let terms = dh.iter().zip(&x[i * tile * k..]);
+        simd::dispatch(
+            #[inline(always)]
+            || match accum {
+                Accum::Replace => out.iter_mut().zip(terms).for_each(|(d, (&dh, &x))| *d = dh * Gelu.df(x)),
+                Accum::Add => out.iter_mut().zip(terms).for_each(|(d, (&dh, &x))| *d += dh * Gelu.df(x)),
+            },
+        );
+    });
+}
+
+/// `dx = dy w^T`.
+pub(crate) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, dy: Rows<T>, w: &[T], tile: usize) {
+    let n = dy.cols;
+    let k = out.len() / dy.rows.max(1);
+    let tile = tile_rows(tile, k, n);
+    let work = 2 * out.len() * n;
+    let panels = Panels::transposed(w, n, k);
+    parallel::for_each_chunk(out, tile * k, work, |i, out| {
+        let rows = out.len() / k;
+        product(out, accum, dy.rows(i * tile, rows), &panels);
+    });
+}
+
+/// `out = x panels`, or added to what is there.
+fn product<T: Float>(out: &mut [T], accum: Accum, x: Rows<T>, panels: &Panels<T>) {
+    Product { out, out_step: panels.cols(), accum, lines: &[line(x)], panels }.run();
+}
+
+/// Rows as the left operand of a product.
+fn line<T: Float>(x: Rows<'_, T>) -> Line<'_, T> {
+    Line { data: x.data, step: x.row_stride, run: x.cols }
+}
+
+/// How many partial sums a weight gradient is made of: depends on the shape alone.
+fn partials(rows: usize) -> usize {
+    rows.div_ceil(256).clamp(1, 8)
+}
+
+impl<T: Float> Op<T> for Linear {
+    /// The rows x, the weight, and whether there is a bias.
+    type Saved = (Option<Tensor<T>>, Option<Tensor<T>>);
+
+    fn shape(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError> {
+        let (x, w) = (inputs[0], inputs[1].dims());
+        if x.rank() == 0 || w.len() != 2 || w[0] != x.last() {
+            return Err(ShapeError::new("expected x [.., in] and w [in, out]"));
+        }
+        if inputs.get(2).is_some_and(|b| b.dims() != [w[1]]) {
+            return Err(ShapeError::new("expected b [out]"));
+        }
+        Ok(vec![x.with(x.rank() - 1, w[1])])
+    }
+
+    fn algo(&self, inputs: &[Shape]) -> &'static str {
+        match (self.gelu, inputs.len() > 2) {
+            (false, true) => "bias",
+            (false, false) => "no_bias",
+            (true, true) => "gelu_bias",
+            (true, false) => "gelu_no_bias",
+        }
+    }
+
+    fn flops(&self, inputs: &[Shape]) -> u64 {
+        2 * (inputs[0].rows() * inputs[1].len()) as u64
+    }
+
+    fn forward(&self, inputs: &[&Tensor<T>], needs: &Needs) -> (Vec<Tensor<T>>, Self::Saved) {
+        let (x, w, b) = (inputs[0], inputs[1], inputs.get(2));
+        let shape = x.shape().with(x.shape().rank() - 1, w.dims()[1]);
+        let rows = Rows::dense(x.data(), x.shape().rows(), w.dims()[0]);
+        let finish = Finish::new(b.map(|b| b.data()), Activation::None);
+        let y = Tensor::build(shape, |out| match self.gelu {
+            true => forward_of_gelu(out, rows, w.data(), &finish, self.tile),
+            false => forward(out, &[rows], w.data(), &finish, self.tile),
+        });
+        let x_matters = needs.get(1) || self.gelu && needs.get(0);
+        (vec![y], (x_matters.then(|| x.clone()), needs.get(0).then(|| w.clone())))
+    }
+
+    /// dx = dy w^T, dw = x^T dy, db = the sum of dy's rows; behind GELU, dx = dy w^T gelu'(x) and dw = gelu(x)^T dy.
+    fn backward(&self, (x, w): Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
+        let g = upstream.only();
+        let (rows, n) = (g.shape().rows(), g.shape().last());
+        let dy = Rows::dense(g.data(), rows, n);
+        if let Some(w) = w {
+            sink.accumulate(0, |out, accum| match x.as_ref().filter(|_| self.gelu) {
+                Some(x) => input_gradient_of_gelu(out, accum, x.data(), dy, w.data(), self.tile),
+                None => input_gradient(out, accum, dy, w.data(), self.tile),
+            });
+        }
+        if let Some(x) = x {
+            let k = x.shape().last();
+            sink.accumulate(1, |out, accum| {
+                let h = if self.gelu { apply_gelu(&x) } else { x };
+                weight_gradient(out, accum, Rows::dense(h.data(), rows, k), dy);
+            });
+        }
+        sink.accumulate(2, |out, accum| bias_gradient(out, accum, g.data()));
+    }
+}
+
+/// Rows of a product that adds to a weight's gradient.
+const ROWS: usize = 512;
+
+/// `dw = x^T dy` in a fixed number of partial sums, added up in order: the same bits for any number of threads.
+pub(crate) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, x: Rows<T>, g: Rows<T>) {
+    let (rows, k, n) = (x.rows, x.cols, g.cols);
+    let parts = partials(rows);
+    let step = rows.div_ceil(parts).max(1);
+    let product = |part: usize, out: &mut [T], accum| {
+        let (from, to) = ((part * step).min(rows), ((part + 1) * step).min(rows));
+        if accum == Accum::Replace {
+            out.fill(T::ZERO);
+        }
+        // Sums of sums, as far as rounding goes; and what a product reads stays in the cache.
+        for first in (from..to).step_by(ROWS) {
+            let count = ROWS.min(to - first);
+            let (a_step, b_step) = (x.row_stride, g.row_stride);
+            let terms = &[(x.rows(first, count).data, g.rows(first, count).data)];
+            Gram { out, out_step: n, rows: k, cols: n, terms, count, a_step, b_step }.run();
+        }
+    };
+    if parts == 1 {
+        return product(0, out, accum);
+    }
+    let sums =
+        parallel::map(parts, 2 * rows * k * n, |part| Tensor::build([k, n], |out| product(part, out, Accum::Replace)));
+    sum_into(out, accum, &sums);
+}
+
+/// Adds up partial sums in order.
+pub(crate) fn sum_into<T: Float>(out: &mut [T], accum: Accum, parts: &[Tensor<T>]) {
+    const CHUNK: usize = 1 << 14;
+    let work = out.len() * parts.len();
+    parallel::for_each_chunk(out, CHUNK, work, |i, out| {
+        let range = i * CHUNK..i * CHUNK + out.len();
+        let mut parts = parts.iter().map(|part| &part.data()[range.clone()]);
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                if accum == Accum::Replace {
+                    match parts.next() {
+                        Some(first) => out.copy_from_slice(first),
+                        None => out.fill(T::ZERO),
+                    }
+                }
+                for part in parts {
+                    out.iter_mut().zip(part).for_each(|(s, &x)| *s += x);
+                }
+            },
+        );
+    });
+}
+
+/// The sum of the rows of `g`, in blocks: the same bits for any number of threads.
+pub(crate) fn bias_gradient<T: Float>(out: &mut [T], accum: Accum, g: &[T]) {
+    let n = out.len();
+    if n == 0 {
+        return;
+    }
+    const BLOCK: usize = 256;
+    let rows = g.len() / n;
+    let blocks = parallel::map(rows.div_ceil(BLOCK), g.len(), |i| {
+        let rows = &g[i * BLOCK * n..((i + 1) * BLOCK).min(rows) * n];
+        Tensor::build([n], |sum| {
+            sum.fill(T::ZERO);
+            for row in rows.chunks_exact(n) {
+                sum.iter_mut().zip(row).for_each(|(s, &g)| *s += g);
+            }
+        })
+    });
+    sum_into(out, accum, &blocks);
+}
+
+impl Checked for Linear {
+    fn cases() -> Vec<Case<Self>> {
+        let x = |shape: &[usize]| Input::random("x", shape);
+        let w = |k: usize, n: usize| Input::random("w", [k, n]);
+        let b = |n: usize| Input::random("b", [n]);
+        let tiled = |tile| Linear { tile, gelu: false };
+        let gelu = |tile| Linear { tile, gelu: true };
+        vec![
+            Case::new("with bias", tiled(0), [x(&[2, 3, 5]), w(5, 4), b(4)]),
+            Case::new("without bias", tiled(0), [x(&[2, 3, 5]), w(5, 4)]),
+            Case::new("a vector", tiled(0), [x(&[5]), w(5, 4), b(4)]),
+            Case::new("tile less one", tiled(4), [x(&[3, 5]), w(5, 2), b(2)]),
+            Case::new("a whole tile", tiled(4), [x(&[4, 5]), w(5, 2), b(2)]),
+            Case::new("tile and one", tiled(4), [x(&[5, 5]), w(5, 2), b(2)]),
+            Case::new("partial sums", tiled(0), [x(&[300, 2]), w(2, 3), b(3)]),
+            Case::new("partial sums without bias", tiled(0), [x(&[300, 2]), w(2, 3)]),
+            Case::new("several register tiles", tiled(0), [x(&[25, 11]), w(11, 17), b(17)]),
+            Case::new("GELU, with bias", gelu(0), [x(&[2, 3, 5]), w(5, 4), b(4)]),
+            Case::new("GELU, without bias", gelu(0), [x(&[2, 3, 5]), w(5, 4)]),
+            Case::new("GELU, tile and one", gelu(4), [x(&[5, 5]), w(5, 2), b(2)]),
+            Case::new("GELU, tiles without bias", gelu(4), [x(&[9, 5]), w(5, 2)]),
+            Case::new("GELU, several register tiles", gelu(0), [x(&[25, 11]), w(11, 17), b(17)]),
+            Case::new("GELU, partial sums", gelu(0), [x(&[300, 2]), w(2, 3), b(3)]),
+            Case::new("GELU, no rows", gelu(0), [x(&[0, 2]), w(2, 3), b(3)]).flat(),
+            Case::new("no rows", tiled(0), [x(&[0, 2]), w(2, 3), b(3)]).flat(),
+        ]
+    }
+}
+
+impl<T: Float> Var<T> {
+    /// `x [.., in] w [in, out] (+ b [out])`.
+    #[track_caller]
+    pub fn linear(&self, weight: &Self, bias: Option<&Self>) -> Self {
+        match bias {
+            Some(bias) => apply1(Linear::default(), &[self, weight, bias]),
+            None => apply1(Linear::default(), &[self, weight]),
+        }
+    }
+
+    /// `gelu(x) [.., in] w [in, out] (+ b [out])`, without ever holding the whole of gelu(x).
+    #[track_caller]
+    pub fn gelu_linear(&self, weight: &Self, bias: Option<&Self>) -> Self {
+        let op = Linear { gelu: true, tile: 0 };
+        match bias {
+            Some(bias) => apply1(op, &[self, weight, bias]),
+            None => apply1(op, &[self, weight]),
+        }
+    }
+}

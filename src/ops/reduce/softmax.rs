@@ -1,0 +1,168 @@
+//! Softmax along any axis.
+
+use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::tensor::pool::Buffer;
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+
+/// `y = e^(x - max) / sum e^(x - max)`, maximum and sum along an axis. Where all of them are minus infinity (or one is
+/// plus infinity or NaN) the result is NaN.
+#[derive(Clone, Copy, Debug)]
+pub struct Softmax {
+    /// The axis along which the result sums to 1.
+    pub axis: usize,
+}
+
+/// What stands before the axis, its extent, and what comes after.
+fn cut(shape: &Shape, axis: usize) -> [usize; 3] {
+    let d = shape.dims();
+    [d[..axis].iter().product(), d[axis], d[axis + 1..].iter().product()]
+}
+
+impl<T: Float> Op<T> for Softmax {
+    /// The result.
+    type Saved = Option<Tensor<T>>;
+
+    fn shape(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError> {
+        if self.axis >= inputs[0].rank() {
+            return Err(ShapeError::new(format!("no dimension {}", self.axis)));
+        }
+        Ok(vec![inputs[0]])
+    }
+
+    fn algo(&self, inputs: &[Shape]) -> &'static str {
+        if cut(&inputs[0], self.axis)[2] == 1 { "last_axis" } else { "inner_axis" }
+    }
+
+    fn forward(&self, inputs: &[&Tensor<T>], needs: &Needs) -> (Vec<Tensor<T>>, Self::Saved) {
+        let x = inputs[0];
+        let [_, n, inner] = cut(x.shape(), self.axis);
+        let chunk = if inner == 1 { n * (1usize << 12).div_ceil(n.max(1)) } else { n * inner };
+        let y = Tensor::build(*x.shape(), |out| {
+            let work = 16 * out.len();
+            parallel::for_each_chunk(out, chunk, work, |i, out| {
+                let x = &x.data()[i * chunk..][..out.len()];
+                if inner == 1 {
+                    simd::dispatch(
+                        #[inline(always)]
+                        || out.chunks_exact_mut(n).zip(x.chunks_exact(n)).for_each(|(y, x)| row(y, x)),
+                    );
+                } else {
+                    let mut scratch = Buffer::stale(inner);
+                    simd::dispatch(
+                        #[inline(always)]
+                        || columns(out, x, &mut scratch),
+                    );
+                }
+            });
+        });
+        let saved = needs.any().then(|| y.clone());
+        (vec![y], saved)
+    }
+
+    /// dx = y (dy - sum dy y), the sum along the axis.
+    fn backward(&self, saved: Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
+        let (y, g) = (saved.expect("saved for a wanted gradient"), upstream.only());
+        let [_, n, inner] = cut(y.shape(), self.axis);
+        let chunk = if inner == 1 { n * (1usize << 12).div_ceil(n.max(1)) } else { n * inner };
+        let inner = inner.max(1);
+        sink.accumulate(0, |out, accum| {
+            let work = 6 * out.len();
+            parallel::for_each_chunk(out, chunk, work, |i, out| {
+                let (y, g) = (&y.data()[i * chunk..][..out.len()], &g.data()[i * chunk..][..out.len()]);
+                let mut sums = Buffer::stale(inner);
+                simd::dispatch(
+                    #[inline(always)]
+                    || {
+                        let slices = y.chunks_exact(n * inner).zip(g.chunks_exact(n * inner));
+                        for (out, (y, g)) in out.chunks_exact_mut(n * inner).zip(slices) {
+                            sums.fill(T::ZERO);
+                            for (y, g) in y.chunks_exact(inner).zip(g.chunks_exact(inner)) {
+                                sums.iter_mut().zip(y.iter().zip(g)).for_each(|(s, (&y, &g))| *s = y.mul_add(g, *s));
+                            }
+                            let rows = y.chunks_exact(inner).zip(g.chunks_exact(inner));
+                            for (out, (y, g)) in out.chunks_exact_mut(inner).zip(rows) {
+                                let terms = out.iter_mut().zip(y.iter().zip(g).zip(sums.iter()));
+                                match accum {
+                                    Accum::Replace => terms.for_each(|(o, ((&y, &g), &s))| *o = y * (g - s)),
+                                    Accum::Add => terms.for_each(|(o, ((&y, &g), &s))| *o += y * (g - s)),
+                                }
+                            }
+                        }
+                    },
+                );
+            });
+        });
+    }
+}
+
+/// One contiguous row.
+#[inline(always)]
+fn row<T: Float>(y: &mut [T], x: &[T]) {
+    let max = x.iter().fold(-T::INFINITY, |m, &x| m.max(x));
+    y.iter_mut().zip(x).for_each(|(y, &x)| *y = (x - max).exp());
+    let share = T::ONE / y.iter().copied().sum::<T>();
+    y.iter_mut().for_each(|y| *y *= share);
+}
+
+/// All columns of a matrix side by side; `scratch` holds a number for each.
+#[inline(always)]
+fn columns<T: Float>(y: &mut [T], x: &[T], scratch: &mut [T]) {
+    let inner = scratch.len();
+    scratch.fill(-T::INFINITY);
+    for x in x.chunks_exact(inner) {
+        scratch.iter_mut().zip(x).for_each(|(m, &x)| *m = m.max(x));
+    }
+    for (y, x) in y.chunks_exact_mut(inner).zip(x.chunks_exact(inner)) {
+        y.iter_mut().zip(x.iter().zip(scratch.iter())).for_each(|(y, (&x, &m))| *y = (x - m).exp());
+    }
+    scratch.fill(T::ZERO);
+    for y in y.chunks_exact(inner) {
+        scratch.iter_mut().zip(y).for_each(|(s, &y)| *s += y);
+    }
+    scratch.iter_mut().for_each(|s| *s = T::ONE / *s);
+    for y in y.chunks_exact_mut(inner) {
+        y.iter_mut().zip(scratch.iter()).for_each(|(y, &s)| *y *= s);
+    }
+}
+
+impl Checked for Softmax {
+    fn cases() -> Vec<Case<Self>> {
+        let op = |axis| Softmax { axis };
+        let x = |shape: &[usize]| Input::uniform("x", shape, -3.0, 3.0);
+        vec![
+            Case::new("last axis", op(2), [x(&[2, 3, 7])]),
+            Case::new("a vector", op(0), [x(&[9])]),
+            Case::new("middle axis", op(1), [x(&[2, 5, 3])]),
+            Case::new("first axis", op(0), [x(&[4, 3, 2])]),
+            Case::new("inner axis of an image", op(1), [x(&[2, 3, 4, 5])]),
+            Case::new("far from zero", op(0), [Input::uniform("x", [5, 2], 99.0, 101.0)])
+                .tolerance(1e-6, "the step grows with x, and the truncation with its square"),
+            Case::new("one element", op(1), [x(&[3, 1])]).flat(),
+            Case::new("nothing", op(0), [x(&[0, 2])]).flat(),
+        ]
+    }
+}
+
+impl<T: Float> Var<T> {
+    /// e^x over its sum along an axis.
+    #[track_caller]
+    pub fn softmax(&self, axis: usize) -> Self {
+        apply1(Softmax { axis }, &[self])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_sum_to_one_and_a_row_of_minus_infinities_is_nan() {
+        let low = f32::NEG_INFINITY;
+        let x = Var::constant(Tensor::from_vec([2, 3], vec![1e30f32, 2.0, low, low, low, low]));
+        for y in [x.softmax(1), Var::constant(x.value().permute(&[1, 0])).softmax(0)] {
+            let y = if y.dims() == [2, 3] { y.into_value() } else { y.into_value().permute(&[1, 0]) };
+            assert_eq!(y.data()[..3], [1.0, 0.0, 0.0]);
+            assert!(y.data()[3..].iter().all(|y| y.is_nan()));
+        }
+    }
+}

@@ -1,0 +1,165 @@
+//! The street as a dataset: sequences rendered once, kept as pictures; depth is cast again when it is asked for.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use image::RgbImage;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::camera::{Pose, View, drive};
+use super::draw::Draw;
+use super::render::Scene;
+use super::world::World;
+use crate::camera::Intrinsics;
+use crate::data::Dataset;
+use crate::depth::DepthMap;
+use crate::{Error, Result};
+
+/// What to render.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct StreetConfig {
+    /// Height of the pictures in pixels.
+    pub height: usize,
+    /// Width of the pictures in pixels.
+    pub width: usize,
+    /// How many sequences, each a street of its own.
+    pub sequences: usize,
+    /// Frames of each sequence; the first and the last are only neighbours.
+    pub frames: usize,
+    /// Everything follows from it.
+    pub seed: u64,
+    /// Whether other cars drive too: self-supervision takes a static world, so this is off by default.
+    pub moving_cars: bool,
+    /// The camera.
+    pub intrinsics: Intrinsics,
+}
+
+impl Default for StreetConfig {
+    fn default() -> Self {
+        StreetConfig {
+            height: 96,
+            width: 320,
+            sequences: 40,
+            frames: 24,
+            seed: 0,
+            moving_cars: false,
+            intrinsics: Intrinsics::KITTI,
+        }
+    }
+}
+
+/// One street and the drive along it.
+struct Sequence {
+    world: World,
+    poses: Vec<Pose>,
+    images: Vec<Arc<RgbImage>>,
+}
+
+/// Rendered streets: a [`Dataset`] with exact depth and poses. A sample is a frame that has both neighbours.
+pub struct Street {
+    config: StreetConfig,
+    sequences: Vec<Sequence>,
+}
+
+/// What a stream of random numbers is for.
+const WORLD: u64 = 1;
+const PATH: u64 = 2;
+
+impl Street {
+    /// Renders all sequences, on rayon's threads; the pictures are the same for any number of them. `progress` gets the
+    /// number of frames done and of all, from any thread.
+    pub fn render(config: &StreetConfig, progress: Option<&(dyn Fn(usize, usize) + Sync)>) -> Street {
+        let total = config.sequences * config.frames;
+        let done = AtomicUsize::new(0);
+        let sequence = |k: usize| {
+            let world = World::new(&mut Draw::new(config.seed, k as u64, WORLD), config.frames, config.moving_cars);
+            let draw = &mut Draw::new(config.seed, k as u64, PATH);
+            let poses = drive(draw, config.frames, world.lane, world.room, config.moving_cars);
+            let image = |(frame, pose): (usize, &Pose)| {
+                let image = Scene::new(&world, View::new(config, *pose), frame).image();
+                let done = done.fetch_add(1, Ordering::Relaxed) + 1;
+                if let Some(progress) = progress {
+                    progress(done, total);
+                }
+                Arc::new(image)
+            };
+            let images = poses.par_iter().enumerate().map(image).collect();
+            Sequence { world, poses, images }
+        };
+        Street { config: config.clone(), sequences: (0..config.sequences).into_par_iter().map(sequence).collect() }
+    }
+
+    /// What was rendered.
+    pub fn config(&self) -> &StreetConfig {
+        &self.config
+    }
+
+    /// The camera's poses in a sequence, one a frame. Panics if there is no such sequence.
+    pub fn poses(&self, sequence: usize) -> &[Pose] {
+        &self.sequences[sequence].poses
+    }
+
+    /// A frame of a sequence. Panics if there is none such.
+    pub fn frame(&self, sequence: usize, frame: usize) -> &Arc<RgbImage> {
+        &self.sequences[sequence].images[frame]
+    }
+
+    /// The depth of a frame at the pixels' centres: camera z in metres, 0 for the sky. Panics if there is none such.
+    pub fn frame_depth(&self, sequence: usize, frame: usize) -> DepthMap {
+        let Sequence { world, poses, .. } = &self.sequences[sequence];
+        Scene::new(world, View::new(&self.config, poses[frame]), frame).depth()
+    }
+
+    /// The sequence and the frame of a sample. Panics if there is no such sample.
+    pub fn locate(&self, sample: usize) -> (usize, usize) {
+        assert!(sample < self.len(), "the street has {} samples, not one numbered {sample}", self.len());
+        let each = self.config.frames - 2;
+        (sample / each, sample % each + 1)
+    }
+
+    /// The rows `[R | t]` that map points of a sample's camera to the camera of its neighbour at `offset`, in metres.
+    /// Panics if the sequence has no such frame.
+    pub fn relative_pose(&self, sample: usize, offset: i32) -> [[f64; 4]; 3] {
+        let (sequence, frame) = self.locate(sample);
+        let poses = self.poses(sequence);
+        let source = frame.checked_add_signed(offset as isize).and_then(|f| poses.get(f));
+        let source = source.unwrap_or_else(|| panic!("sequence {sequence} has no frame {frame}{offset:+}"));
+        poses[frame].relative_to(source)
+    }
+}
+
+impl Dataset for Street {
+    fn len(&self) -> usize {
+        self.sequences.len() * self.config.frames.saturating_sub(2)
+    }
+
+    fn name(&self, sample: usize) -> String {
+        let (sequence, frame) = self.locate(sample);
+        format!("street seed {}, sequence {sequence}, frame {frame}", self.config.seed)
+    }
+
+    fn image(&self, sample: usize, offset: i32) -> Result<Arc<RgbImage>> {
+        let (sequence, frame) = self.locate(sample);
+        let images = &self.sequences[sequence].images;
+        let found = frame.checked_add_signed(offset as isize).and_then(|f| images.get(f));
+        found.cloned().ok_or_else(|| {
+            let message = format!("{}: no frame at {offset:+}; the sequence has {}", self.name(sample), images.len());
+            Error::setting("offset", message)
+        })
+    }
+
+    fn intrinsics(&self, _sample: usize) -> Intrinsics {
+        self.config.intrinsics
+    }
+
+    fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {
+        let (sequence, frame) = self.locate(sample);
+        Ok(Some(self.frame_depth(sequence, frame)))
+    }
+}
+
+#[cfg(test)]
+#[path = "tests.rs"]
+mod tests;

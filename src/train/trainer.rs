@@ -1,0 +1,288 @@
+//! One training step, and the state that it moves.
+
+use std::collections::{BTreeMap, HashMap};
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use super::rotations::Lesson;
+use crate::data::batch::Batch;
+use crate::error::{Error, Result};
+use crate::formats::safetensors;
+use crate::monovit::MonoVit;
+use crate::monovit::config::Config;
+use crate::monovit::loss::{Loss, LossConfig, Scales, TieBreak, Views, loss};
+use crate::nn::{Context, Params};
+use crate::optim::{AdamW, Average, Group, Schedule, clip_norm};
+use crate::random::Random;
+use crate::tensor::profile;
+use crate::tensor::{Tape, Tensor, Var};
+
+/// How weights are moved.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OptimConfig {
+    /// The learning rate of the depth encoder.
+    pub encoder_rate: f64,
+    /// The learning rate of the depth decoder.
+    pub rate: f64,
+    /// The learning rate of the pose networks. Their output is scaled by 0.01, so at the depth's rate they follow a
+    /// hundred times as slowly.
+    pub pose_rate: f64,
+    /// Decoupled weight decay, of every parameter.
+    pub decay: f64,
+    /// b1 and b2 of AdamW.
+    pub betas: [f64; 2],
+    /// The bound on the norm of all gradients; 0 for none.
+    pub clip: f64,
+    /// The decay of the average of the weights; 0 for none.
+    pub average: f64,
+    /// The factor on both rates, step by step.
+    pub schedule: Schedule,
+}
+
+/// What a step reports.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct StepReport {
+    /// The step, from 1.
+    pub step: u64,
+    /// The total loss.
+    pub loss: f64,
+    /// The per-pixel minimum of photometric errors.
+    pub photometric: f64,
+    /// The same over warped neighbours alone.
+    pub warped: f64,
+    /// The same over unwarped neighbours alone.
+    pub unwarped: f64,
+    /// The smoothness term, weighted.
+    pub smoothness: f64,
+    /// The share of pixels that auto-masking leaves in.
+    pub auto_mask: f64,
+    /// The learning rates: encoder, decoder, pose networks.
+    pub learning_rates: [f64; 3],
+    /// The norm of all gradients, before clipping.
+    pub grad_norm: f64,
+}
+
+/// A model in training.
+pub struct Trainer {
+    /// The networks.
+    pub model: MonoVit,
+    /// Their parameters.
+    pub params: Params<f32>,
+    optim: OptimConfig,
+    loss: LossConfig,
+    adamw: AdamW<f32>,
+    average: Option<Average<f32>>,
+    ties: TieBreak<f32>,
+    seed: u64,
+}
+
+/// What the loss compares in a batch.
+fn views(batch: &Batch, scales: Scales) -> Views<f32> {
+    let smaller = if scales == Scales::Own { batch.smaller_sources() } else { Vec::new() };
+    Views {
+        pyramid: batch.pyramid.iter().cloned().map(Var::constant).collect(),
+        sources: batch.sources.iter().cloned().map(Var::constant).collect(),
+        smaller_sources: smaller.into_iter().map(|s| s.into_iter().map(Var::constant).collect()).collect(),
+        intrinsics: batch.intrinsics.clone(),
+    }
+}
+
+const TIE_STREAM: u64 = 3 << 40;
+const DROP_STREAM: u64 = 4 << 40;
+
+impl Trainer {
+    /// A model at its start.
+    pub fn new(config: Config, optim: OptimConfig, loss: LossConfig, seed: u64) -> Self {
+        let (model, params) = MonoVit::new(config, seed);
+        Self::of(model, params, optim, loss, seed)
+    }
+
+    /// A model with the given weights.
+    pub fn of(model: MonoVit, params: Params<f32>, optim: OptimConfig, loss: LossConfig, seed: u64) -> Self {
+        let mut adamw = AdamW::new(&params);
+        adamw.betas = optim.betas;
+        let average = (optim.average > 0.0).then(|| Average::new(&params, optim.average));
+        let ties = TieBreak::new(loss.tie_break, &mut Random::new(seed, TIE_STREAM - 1));
+        Trainer { model, params, optim, loss, adamw, average, ties, seed }
+    }
+
+    /// Teaches the pose network known rotations, before the first step; `tell` hears of every step and its error in
+    /// pixels, and says whether to go on. Whether it came to the end.
+    pub fn learn_rotations(
+        &mut self,
+        mut next_batch: impl FnMut() -> Result<Batch>,
+        mut tell: impl FnMut(u64, f64) -> bool,
+    ) -> Result<bool> {
+        let shake = self.loss.shake;
+        let mut lesson = Lesson::new(shake, &self.params, self.seed);
+        for step in 1..=shake.steps {
+            let error = lesson.step(&self.model, &mut self.params, &next_batch()?);
+            if !tell(step, error) {
+                return Ok(false);
+            }
+        }
+        self.average = (self.optim.average > 0.0).then(|| Average::new(&self.params, self.optim.average));
+        Ok(true)
+    }
+
+    /// Steps taken.
+    pub fn steps(&self) -> u64 {
+        self.adamw.steps
+    }
+
+    /// The weights to use: the average, where there is one.
+    pub fn weights(&self) -> Params<f32> {
+        self.average.as_ref().map_or_else(|| self.params.clone(), |a| a.params(&self.params))
+    }
+
+    /// The loss of a batch, and the context it was computed in.
+    fn forward(&self, tape: &Tape<f32>, batch: &Batch) -> (Context<f32>, Loss<f32>) {
+        let step = self.adamw.steps;
+        let c = Context::training(&self.params, tape, Random::new(self.seed, DROP_STREAM.wrapping_add(step)));
+        let [prev, target, next] = batch.seen.each_ref().map(|t| Var::constant(t.clone()));
+        let disparities = self.model.disparities(&c, &target);
+        let transforms = self.model.transforms(&c, &prev, &target, &next);
+        let mut random = Random::new(self.seed, TIE_STREAM.wrapping_add(step));
+        let config = LossConfig { auto_mask: self.loss.auto_mask && step >= self.loss.auto_mask_after, ..self.loss };
+        let found =
+            loss(&disparities, &transforms, &views(batch, config.scales), &config, Some((&self.ties, &mut random)));
+        (c, found)
+    }
+
+    /// One step: forward, backward, AdamW.
+    ///
+    /// # Errors
+    /// If the loss or a gradient is not finite: the step, and the op that first made such a number. Nothing is changed.
+    pub fn step(&mut self, batch: &Batch) -> Result<StepReport> {
+        let step = self.adamw.steps + 1;
+        let tape = Tape::new();
+        let (c, found) = self.forward(&tape, batch);
+        let total = found.total.value().item() as f64;
+        if !total.is_finite() {
+            return Err(self.explain(step, batch));
+        }
+        let objective = match self.loss.shake.term(step - 1, &self.model, &c, batch, self.seed) {
+            Some(term) => &found.total + term,
+            None => found.total.clone(),
+        };
+        let mut all = objective.backward();
+        let mut gradients = c.gradients(&mut all);
+        // From here on nobody else holds the weights: they are changed in place.
+        let moved = c.into_moved();
+        let bound = if self.optim.clip > 0.0 { self.optim.clip } else { f64::INFINITY };
+        let grad_norm = profile::phase("norm of the gradients", || clip_norm(&mut gradients, bound));
+        if !grad_norm.is_finite() {
+            let bad = self.params.iter().zip(&gradients).find(|(_, g)| g.as_ref().is_some_and(|g| !g.is_finite()));
+            let name = bad.map_or("of a parameter", |((_, p), _)| p.name());
+            return Err(Error::Failed(format!(
+                "step {step}: the gradient of {name} is not finite (the loss is {total})"
+            )));
+        }
+        let factor = self.optim.schedule.factor(step);
+        let learning_rates = [self.optim.encoder_rate, self.optim.rate, self.optim.pose_rate].map(|r| r * factor);
+        let decay = self.optim.decay;
+        let group = |name: &str| {
+            let which = if name.starts_with("encoder.") {
+                0
+            } else if name.starts_with("depth.") {
+                1
+            } else {
+                2
+            };
+            Group { learning_rate: learning_rates[which], decay }
+        };
+        profile::phase("adamw", || self.adamw.step(&mut self.params, &gradients, group));
+        profile::phase("running statistics", || {
+            for (id, value) in moved {
+                self.params.set(id, value);
+            }
+        });
+        if let Some(average) = &mut self.average {
+            profile::phase("weight averaging", || average.update(&self.params, step));
+        }
+        let report = StepReport {
+            step,
+            loss: total,
+            photometric: found.photometric,
+            warped: found.warped,
+            unwarped: found.unwarped,
+            smoothness: found.smoothness,
+            auto_mask: found.auto_mask,
+            learning_rates,
+            grad_norm,
+        };
+        profile::phase("freeing", move || drop((all, gradients, objective, found, tape)));
+        Ok(report)
+    }
+
+    /// Runs the forward pass once more, looking at every number.
+    fn explain(&self, step: u64, batch: &Batch) -> Error {
+        let (_, entries) = profile::record(true, || self.forward(&Tape::new(), batch));
+        let culprit = entries.iter().enumerate().find(|(_, e)| !e.finite);
+        Error::Failed(match culprit {
+            Some((i, e)) => format!(
+                "step {step}: the loss is not finite; the first op that made such a number is {} [{}], op {i} of the \
+                 forward pass, output {}. The last good checkpoint is kept: try a smaller learning rate",
+                e.op, e.algo, e.output
+            ),
+            None => format!("step {step}: the loss is not finite, and was so only once: a hardware fault?"),
+        })
+    }
+
+    /// The mean photometric error of batches, with the given weights in evaluation mode: what validation selects by.
+    pub fn validate(&self, params: &Params<f32>, batches: &[Batch]) -> f64 {
+        let c = Context::inference(params);
+        let errors = batches.iter().map(|batch| {
+            let [prev, target, next] = batch.seen.each_ref().map(|t| Var::constant(t.clone()));
+            let disparities = self.model.disparities(&c, &target);
+            let transforms = self.model.transforms(&c, &prev, &target, &next);
+            loss(&disparities[..1], &transforms, &views(batch, Scales::Full), &self.loss, None).photometric
+        });
+        let errors: Vec<f64> = errors.collect();
+        errors.iter().sum::<f64>() / errors.len().max(1) as f64
+    }
+
+    /// Writes the whole state: weights, moments, average, step.
+    pub fn save(&self, path: &Path, metadata: HashMap<String, String>) -> Result<()> {
+        let mut tensors: BTreeMap<String, Tensor<f32>> = BTreeMap::new();
+        for (id, p) in self.params.iter() {
+            tensors.insert(format!("weights/{}", p.name()), p.value.clone());
+            if let Some([m, v]) = &self.adamw.moments[id.0] {
+                tensors.insert(format!("first_moment/{}", p.name()), m.clone());
+                tensors.insert(format!("second_moment/{}", p.name()), v.clone());
+            }
+            if let Some(average) = &self.average {
+                tensors.insert(format!("average/{}", p.name()), average.values[id.0].clone());
+            }
+        }
+        let mut metadata = metadata;
+        metadata.insert("steps".into(), self.adamw.steps.to_string());
+        safetensors::write(path, &tensors, metadata)
+    }
+
+    /// Goes on from a state written by [`save`](Trainer::save).
+    pub fn load(&mut self, path: &Path) -> Result<()> {
+        let mut contents = safetensors::read::<f32>(path)?;
+        let broken = |what: &str| Error::file(path, format!("{what}: not a training state of this configuration"));
+        let steps = contents.metadata.get("steps").and_then(|s| s.parse().ok());
+        self.adamw.steps = steps.ok_or_else(|| broken("the number of steps is missing"))?;
+        let ids: Vec<_> = self.params.iter().map(|(id, p)| (id, p.name().to_owned(), *p.value.shape())).collect();
+        for (id, name, shape) in ids {
+            let mut take = |kind: &str| match contents.tensors.remove(&format!("{kind}/{name}")) {
+                Some(t) if *t.shape() != shape => Err(broken(&format!("{kind}/{name} has shape {}", t.shape()))),
+                found => Ok(found),
+            };
+            self.params.set(id, take("weights")?.ok_or_else(|| broken(&format!("{name} is missing")))?);
+            self.adamw.moments[id.0] = match (take("first_moment")?, take("second_moment")?) {
+                (Some(m), Some(v)) => Some([m, v]),
+                _ => None,
+            };
+            if let Some(average) = &mut self.average {
+                average.values[id.0] = take("average")?.ok_or_else(|| broken("the averaged weights are missing"))?;
+            }
+        }
+        Ok(())
+    }
+}

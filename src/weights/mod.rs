@@ -1,0 +1,71 @@
+//! Weights from elsewhere, and back: the published files (`.pth`), safetensors, `.npz`.
+//!
+//! ```no_run
+//! use parallax::weights::{Need, load};
+//!
+//! // A folder with encoder.pth and depth.pth, one file with all, or a run of this program.
+//! let weights = load(&["mono_640x192".into()], Need::Depth, false)?;
+//! println!("{} at {} x {}", weights.config.preset.name(), weights.config.width, weights.config.height);
+//! println!("{}", weights.report);
+//! # Ok::<(), parallax::Error>(())
+//! ```
+//!
+//! [`Sources`] opens the files and finds out what each tensor is (`names.rs`) and which size of the network they belong
+//! to (`sizes.rs`). Loading is strict: every tensor of a network that is there, and no other, each finite, and the same
+//! under all its names. [`start_encoder`] and [`start_pose_encoder`] take networks that were trained on ImageNet.
+//! [`save`] writes any of these forms.
+
+mod imagenet;
+mod names;
+mod save;
+mod sizes;
+mod sources;
+
+pub use imagenet::{start_encoder, start_pose_encoder};
+pub use names::NETWORKS;
+pub use save::{Form, outputs, save};
+pub use sources::{Need, Sources};
+
+use std::path::PathBuf;
+
+use crate::error::Result;
+use crate::monovit::{Ablation, MonoVit, Preset};
+use crate::nn::{Params, Report};
+use crate::train::run::RunConfig;
+
+/// A model with weights from files.
+pub struct Weights {
+    /// The networks.
+    pub model: MonoVit,
+    /// Their parameters. Those that were not loaded are as a new model's.
+    pub params: Params<f32>,
+    /// The size, the pictures' size, the range of depths.
+    pub config: RunConfig,
+    /// What was loaded and what was not.
+    pub report: Report,
+}
+
+/// Loads weights from files and folders; see [`Sources::open`] for which.
+///
+/// # Errors
+/// As [`Sources::open`], [`Sources::config`] and [`Sources::fill`]; if the tensors are of another size than the
+/// configuration beside them, unless `allow_partial`.
+pub fn load(paths: &[PathBuf], need: Need, allow_partial: bool) -> Result<Weights> {
+    let sources = Sources::open(paths)?;
+    let config = sources.config(need)?;
+    // Of a network that is not wholly a preset, tensor by tensor will do.
+    if !allow_partial && config.ablation == Ablation::default() {
+        sources.expect(config.preset)?;
+    }
+    let (model, mut params) = MonoVit::new(config.model(), 0);
+    let report = sources.fill(&mut params, need, allow_partial)?;
+    Ok(Weights { model, params, config, report })
+}
+
+/// The size of the network that some files are weights of.
+///
+/// # Errors
+/// As [`Sources::open`] and [`Sources::preset`].
+pub fn preset_of(paths: &[PathBuf]) -> Result<Preset> {
+    Sources::open(paths)?.preset(Need::All)
+}

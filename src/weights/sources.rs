@@ -1,0 +1,256 @@
+//! The files that weights come from, together.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use super::names::{NETWORKS, Place, place, unwrapped};
+use super::sizes::Sizes;
+use crate::error::{Error, Result};
+use crate::formats::TensorFile;
+use crate::formats::pth::shown;
+use crate::monovit::Preset;
+use crate::monovit::loss::LossConfig;
+use crate::nn::{Named, Params, Report, Skipped, fit};
+use crate::train::run::{RunConfig, check_size};
+
+/// Which of the four networks have to be there. One that is there at all has to be there whole.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Need {
+    /// Encoder and decoder, to predict depth; the pose networks may be absent.
+    Depth,
+    /// All four, to go on training.
+    All,
+    /// Any of them.
+    Any,
+    /// One of them; what the files hold of others is passed over.
+    Only(&'static str),
+}
+
+impl Need {
+    /// Whether this network has to be there.
+    pub fn requires(self, network: &str) -> bool {
+        match self {
+            Need::Depth => matches!(network, "encoder" | "depth"),
+            Need::All => true,
+            Need::Any => false,
+            Need::Only(one) => network == one,
+        }
+    }
+}
+
+/// Opened files, their tensors under the model's names.
+#[derive(Clone, Debug)]
+pub struct Sources {
+    paths: Vec<PathBuf>,
+    pub(super) tensors: Vec<Named>,
+    unexpected: Vec<String>,
+    skipped: Vec<Skipped>,
+    /// `height` and `width`, where a file says them.
+    size: [Option<usize>; 2],
+    config: Option<RunConfig>,
+}
+
+impl Sources {
+    /// Opens files, or folders: a run's, which means its `best.safetensors`, or one with `encoder.pth`, `depth.pth`,
+    /// `pose_encoder.pth`, `pose.pth` (or some of them, or with other endings).
+    ///
+    /// # Errors
+    /// Names the file that cannot be read, or the folder without weights.
+    pub fn open(paths: &[PathBuf]) -> Result<Self> {
+        let mut sources = Sources {
+            paths: paths.to_vec(),
+            tensors: Vec::new(),
+            unexpected: Vec::new(),
+            skipped: Vec::new(),
+            size: [None, None],
+            config: None,
+        };
+        for path in paths {
+            let files = if path.is_dir() { files_of(path)? } else { vec![path.clone()] };
+            for file in files {
+                sources.add(TensorFile::open(&file)?)?;
+            }
+        }
+        Ok(sources)
+    }
+
+    fn add(&mut self, file: TensorFile) -> Result<()> {
+        let path = Arc::new(file.path);
+        for (origin, tensor) in file.tensors {
+            match place(&origin) {
+                Place::Model(name) => self.tensors.push(Named { name, origin, file: path.clone(), tensor }),
+                Place::Useless(what) => self.skipped.push(Skipped { name: shown(&origin), what }),
+                Place::Unknown => self.unexpected.push(shown(&origin)),
+            }
+        }
+        for (slot, what) in self.size.iter_mut().zip(["height", "width"]) {
+            let said = file.integers.iter().find(|(name, _)| unwrapped(name) == what);
+            if let (None, Some((_, pixels))) = (*slot, said) {
+                let pixels = usize::try_from(*pixels).unwrap_or(0);
+                check_size(what, pixels).map_err(|e| Error::file(&*path, e.to_string()))?;
+                *slot = Some(pixels);
+            }
+        }
+        if let (None, Some(text)) = (&self.config, file.metadata.get("parallax")) {
+            let wrong = |why: String| Error::file(&*path, format!("its configuration: {why}"));
+            let config: RunConfig = serde_json::from_str(text).map_err(|e| wrong(e.to_string()))?;
+            config.check().map_err(|e| wrong(e.to_string()))?;
+            self.config = Some(config);
+        }
+        Ok(())
+    }
+
+    /// The same, with the tensors of one network alone.
+    pub(super) fn only(&self, network: &str) -> Self {
+        let of_it = |t: &&Named| t.name.split('.').next() == Some(network);
+        Sources { tensors: self.tensors.iter().filter(of_it).cloned().collect(), ..self.clone() }
+    }
+
+    /// Every path that was given, for messages.
+    fn all_paths(&self) -> PathBuf {
+        let all: Vec<String> = self.paths.iter().map(|p| p.display().to_string()).collect();
+        all.join(", ").into()
+    }
+
+    fn error(&self, message: String) -> Error {
+        Error::file(self.all_paths(), message)
+    }
+
+    /// The preset that the tensors' shapes are those of.
+    ///
+    /// # Errors
+    /// If there is none: names the nearest one and what differs. If there are several, because there are too few tensors
+    /// to tell them apart, unless `need` is [`Need::Any`].
+    pub fn preset(&self, need: Need) -> Result<Preset> {
+        let sizes = self.some_sizes()?;
+        match sizes.fitting()[..] {
+            [one] => Ok(one),
+            [first, ..] if need == Need::Any => Ok(first),
+            [] => {
+                let (nearest, differences) = sizes.nearest();
+                let message = format!(
+                    "of no known size: the nearest is {}, but these weights have {}",
+                    nearest.name(),
+                    differences.join(", ")
+                );
+                Err(self.error(message))
+            }
+            ref several => {
+                let names: Vec<&str> = several.iter().map(|p| p.name()).collect();
+                let message = format!("could be of the sizes {} alike: the depth encoder is missing", names.join(", "));
+                Err(self.error(message))
+            }
+        }
+    }
+
+    fn some_sizes(&self) -> Result<Sizes> {
+        let sizes = Sizes::of(&self.tensors);
+        if sizes.is_empty() {
+            let example = self.unexpected.first().map_or(String::new(), |n| format!(", such as {n}"));
+            let others = self.unexpected.len() + self.skipped.len();
+            let message = format!("holds none of MonoViT's weights, but {others} other tensors{example}");
+            return Err(self.error(message));
+        }
+        Ok(sizes)
+    }
+
+    /// Makes sure that the tensors are of this size.
+    ///
+    /// # Errors
+    /// Says what differs, and which preset they are of.
+    pub fn expect(&self, preset: Preset) -> Result<()> {
+        let sizes = self.some_sizes()?;
+        let (differences, _) = sizes.differences(&preset.config());
+        if differences.is_empty() {
+            return Ok(());
+        }
+        let advice = match sizes.fitting()[..] {
+            [one] => format!("; they are of the preset {}", one.name()),
+            _ => String::new(),
+        };
+        let message =
+            format!("does not fit the preset {}: these weights have {}{advice}", preset.name(), differences.join(", "));
+        Err(self.error(message))
+    }
+
+    /// The configuration to use the weights with: the one they were trained with, where a file says it; otherwise the
+    /// usual one of their size, for pictures of the size that an encoder's file says, or the preset's.
+    ///
+    /// # Errors
+    /// If a file's configuration does not fit its own tensors, or as [`Sources::preset`].
+    pub fn config(&self, need: Need) -> Result<RunConfig> {
+        if let Some(config) = &self.config {
+            return Ok(config.clone());
+        }
+        let preset = self.preset(need)?;
+        let (height, width) = match preset {
+            Preset::Pico | Preset::Nano => (96, 320),
+            Preset::Tiny | Preset::Xsmall | Preset::Small | Preset::Base => (192, 640),
+        };
+        let [said_height, said_width] = self.size;
+        let usual = RunConfig::new(preset, 1);
+        // What a run of ours changes in the loss is not known of others.
+        let loss = LossConfig::default();
+        Ok(RunConfig { height: said_height.unwrap_or(height), width: said_width.unwrap_or(width), loss, ..usual })
+    }
+
+    /// Puts the tensors into a model's parameters: all or none, unless `allow_partial`, which puts in what fits.
+    ///
+    /// # Errors
+    /// If the tensors are not exactly those of the networks that are needed, or there at all; in any case if none fits,
+    /// if one is not finite, or if two for one parameter differ. Nothing is changed then.
+    pub fn fill(&self, params: &mut Params<f32>, need: Need, allow_partial: bool) -> Result<Report> {
+        let network = |name: &str| NETWORKS.into_iter().find(|n| name.split('.').next() == Some(*n));
+        let mut skipped = self.skipped.clone();
+        let mut unexpected = self.unexpected.clone();
+        let mut tensors = self.tensors.clone();
+        if let Need::Only(one) = need {
+            let (kept, others): (Vec<Named>, Vec<Named>) =
+                tensors.into_iter().partition(|t| network(&t.name) == Some(one));
+            tensors = kept;
+            let what = "tensors of other networks";
+            skipped.extend(others.into_iter().map(|t| Skipped { name: shown(&t.origin), what }));
+        }
+        let fitted = fit(params, &tensors)?;
+        let mut report = fitted.report.clone();
+        unexpected.append(&mut report.unexpected);
+        (report.unexpected, report.skipped) = (unexpected, skipped);
+        for one in NETWORKS {
+            let there = tensors.iter().any(|t| network(&t.name) == Some(one));
+            if !there && !need.requires(one) {
+                report.missing.retain(|name| network(name) != Some(one));
+                report.absent.push(one.to_owned());
+            }
+        }
+        if report.matched.is_empty() {
+            let problem = report.problem().unwrap_or_else(|| "nothing of the network is there".into());
+            return Err(self.error(format!("no tensor fits: {problem}")));
+        }
+        if let (false, Some(problem)) = (allow_partial, report.problem()) {
+            let message =
+                format!("not exactly the weights of this network: {problem}. --allow-partial takes what fits");
+            return Err(self.error(message));
+        }
+        fitted.put_into(params);
+        Ok(report)
+    }
+}
+
+/// The files of weights in a folder.
+fn files_of(folder: &Path) -> Result<Vec<PathBuf>> {
+    let best = folder.join("best.safetensors");
+    if best.is_file() {
+        return Ok(vec![best]);
+    }
+    let file = |network: &str| {
+        let named = |ending: &str| folder.join(format!("{network}.{ending}"));
+        ["pth", "pt", "safetensors", "npz"].map(named).into_iter().find(|p| p.is_file())
+    };
+    let files: Vec<PathBuf> = NETWORKS.into_iter().filter_map(file).collect();
+    if files.is_empty() {
+        let message = "holds no weights: expected a run's best.safetensors, or encoder.pth, depth.pth, \
+                       pose_encoder.pth, pose.pth (also as .pt, .safetensors, .npz)";
+        return Err(Error::file(folder, message));
+    }
+    Ok(files)
+}
