@@ -2,9 +2,9 @@
 
 use std::time::Duration;
 
-use super::op::{Needs, Op};
-use crate::tensor::profile;
-use crate::tensor::profile::{Entry, Work};
+use super::op::{Needs, Op, ShapeError};
+use crate::tensor::profile::{self, Entry, Work};
+use crate::tensor::tape::Backward;
 use crate::tensor::{Float, GradSink, Shape, Tape, Tensor, Upstream, Var};
 
 /// Runs an op with one output (auxiliary ones are dropped).
@@ -22,48 +22,92 @@ pub fn apply1<T: Float, O: Op<T>>(op: O, inputs: &[&Var<T>]) -> Var<T> {
 /// If the shapes do not fit, with the op's name and the shapes; or if two inputs are on different tapes.
 #[track_caller]
 pub fn apply<T: Float, O: Op<T>>(op: O, inputs: &[&Var<T>]) -> Vec<Var<T>> {
+    match op.run(inputs) {
+        Ok(outputs) => outputs,
+        Err(why) => panic!("{why}"),
+    }
+}
+
+/// [`apply`] without its panics: the code that is compiled for every op and element type, which is why it is short.
+pub(super) fn execute<T: Float, O: Op<T>>(op: O, inputs: &[&Var<T>]) -> Result<Vec<Var<T>>, String> {
+    node(O::NAME, &op, inputs)
+}
+
+/// What making a node takes of an op, whatever it saves.
+trait Node<T: Float> {
+    fn outputs(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError>;
+    fn auxiliary(&self) -> usize;
+    fn entry(&self, inputs: &[Shape], outputs: &[Shape], needs: &Needs) -> Entry;
+    fn compute(&self, inputs: &[&Tensor<T>], needs: &Needs) -> (Vec<Tensor<T>>, Option<Backward<T>>);
+}
+
+impl<T: Float, O: Op<T>> Node<T> for O {
+    fn outputs(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError> {
+        self.shape(inputs)
+    }
+    fn auxiliary(&self) -> usize {
+        Op::auxiliary(self)
+    }
+    fn entry(&self, inputs: &[Shape], outputs: &[Shape], needs: &Needs) -> Entry {
+        let (flops, traffic) = (self.flops(inputs), self.traffic(inputs, outputs, needs));
+        let traffic = traffic.map(|elements| elements * size_of::<T>() as u64);
+        entry((O::NAME, self.algo(inputs)), [inputs, outputs], needs, flops, traffic)
+    }
+    fn compute(&self, inputs: &[&Tensor<T>], needs: &Needs) -> (Vec<Tensor<T>>, Option<Backward<T>>) {
+        let (outputs, saved) = self.forward(inputs, needs);
+        if !needs.any() {
+            return (outputs, None);
+        }
+        let op = self.clone();
+        (outputs, Some(Box::new(move |upstream, sink| op.backward(saved, upstream, sink))))
+    }
+}
+
+fn node<T: Float>(name: &str, op: &dyn Node<T>, inputs: &[&Var<T>]) -> Result<Vec<Var<T>>, String> {
     let shapes: Vec<Shape> = inputs.iter().map(|v| *v.shape()).collect();
-    let expected = match op.shape(&shapes) {
-        Ok(expected) => expected,
-        Err(why) => panic!("{}: {why} (inputs {shapes:?})", O::NAME),
-    };
-    let tape = common_tape::<T>(O::NAME, inputs);
+    let expected = op.outputs(&shapes).map_err(|why| format!("{name}: {why} (inputs {shapes:?})"))?;
+    let tape = common_tape::<T>(name, inputs)?;
     let needs = Needs(inputs.iter().map(|v| v.is_tracked()).collect());
     let values: Vec<&Tensor<T>> = inputs.iter().map(|v| v.value()).collect();
 
-    let running = profile::begin_forward(|| entry::<T, O>(&op, &shapes, &expected, &needs));
-    let (mut outputs, saved) = op.forward(&values, &needs);
+    let running = profile::begin_forward(|| op.entry(&shapes, &expected, &needs));
+    let (mut outputs, backward) = op.compute(&values, &needs);
     let place = profile::end_forward(running, &outputs);
 
-    debug_assert!(outputs.iter().map(Tensor::shape).eq(&expected), "{}: the shape rule says {expected:?}", O::NAME);
+    debug_assert!(outputs.iter().map(Tensor::shape).eq(&expected), "{name}: the shape rule says {expected:?}");
     let auxiliary = outputs.split_off(outputs.len() - op.auxiliary());
-    let mut vars = match tape {
-        None => outputs.into_iter().map(Var::constant).collect(),
-        Some(tape) => {
+    let mut vars = match (tape, backward) {
+        (Some(tape), Some(backward)) => {
             let slots = inputs.iter().map(|v| v.slot()).collect();
-            let backward = move |upstream: Upstream<T>, sink: &mut GradSink<'_, T>| {
+            let timed = move |upstream: Upstream<T>, sink: &mut GradSink<'_, T>| {
                 let running = profile::begin_backward(place);
-                op.backward(saved, upstream, sink);
+                backward(upstream, sink);
                 profile::end_backward(running);
             };
-            tape.record(slots, outputs, Box::new(backward))
+            tape.record(slots, outputs, Box::new(timed))
         }
+        _ => outputs.into_iter().map(Var::constant).collect(),
     };
     vars.extend(auxiliary.into_iter().map(Var::constant));
-    vars
+    Ok(vars)
 }
 
-/// What is said of an op that is about to run.
-fn entry<T: Float, O: Op<T>>(op: &O, inputs: &[Shape], outputs: &[Shape], needs: &Needs) -> Entry {
-    let flops = op.flops(inputs);
-    let [forward, backward] = op.traffic(inputs, outputs, needs).map(|elements| elements * size_of::<T>() as u64);
+/// What is said of an op (its name and kernel path) that is about to run, from its arithmetic and its traffic in bytes,
+/// forward and backward.
+fn entry(
+    (op, algo): (&'static str, &'static str),
+    [inputs, outputs]: [&[Shape]; 2],
+    needs: &Needs,
+    flops: u64,
+    [forward, backward]: [u64; 2],
+) -> Entry {
     // The gradients of both factors of a product cost as much as the product each; where only one is wanted, half.
     let factors = inputs.len().clamp(1, 2);
     let wanted = (0..factors).filter(|&i| needs.get(i)).count() as u64;
     let back = Work { flops: 2 * flops * wanted / factors as u64, bytes: if needs.any() { backward } else { 0 } };
     Entry {
-        op: O::NAME,
-        algo: op.algo(inputs),
+        op,
+        algo,
         flops,
         bytes: forward,
         back,
@@ -74,10 +118,11 @@ fn entry<T: Float, O: Op<T>>(op: &O, inputs: &[Shape], outputs: &[Shape], needs:
     }
 }
 
-#[track_caller]
-fn common_tape<T: Float>(name: &str, inputs: &[&Var<T>]) -> Option<Tape<T>> {
+fn common_tape<T: Float>(name: &str, inputs: &[&Var<T>]) -> Result<Option<Tape<T>>, String> {
     let mut tapes = inputs.iter().filter_map(|v| v.tape());
-    let first = tapes.next()?;
-    assert!(tapes.all(|t| t.is(first)), "{name}: the inputs are on different tapes");
-    Some(first.clone())
+    let Some(first) = tapes.next() else { return Ok(None) };
+    if !tapes.all(|t| t.is(first)) {
+        return Err(format!("{name}: the inputs are on different tapes"));
+    }
+    Ok(Some(first.clone()))
 }

@@ -2,8 +2,9 @@
 
 use std::fmt;
 
+use super::apply::execute;
 use super::case::Case;
-use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 
 /// A differentiable function of tensors: its shape rule, its forward pass, its gradient, and (by [`Checked`]) the
 /// cases that prove the gradient, side by side in one file.
@@ -62,9 +63,15 @@ fn gradients(inputs: &[Shape], needs: &Needs) -> u64 {
 }
 
 /// An op that is in the registry, under its name there; or a [`CustomOp`].
-pub trait Registered {
+pub trait Registered: Sized {
     /// The name, in snake case.
     const NAME: &'static str;
+
+    /// Runs the op by code that was compiled where the op stands. Called by `apply` alone.
+    #[doc(hidden)]
+    fn run<T: Float>(self, inputs: &[&Var<T>]) -> Result<Vec<Var<T>>, String>
+    where
+        Self: Op<T>;
 }
 
 /// An op from outside this crate. It has the same duties: cases are required.
@@ -75,6 +82,13 @@ pub trait CustomOp {
 
 impl<O: CustomOp> Registered for O {
     const NAME: &'static str = <O as CustomOp>::NAME;
+
+    fn run<T: Float>(self, inputs: &[&Var<T>]) -> Result<Vec<Var<T>>, String>
+    where
+        Self: Op<T>,
+    {
+        execute(self, inputs)
+    }
 }
 
 /// An op with gradient-check cases. There is no default: an op without cases does not build.

@@ -1,7 +1,9 @@
 //! The registry: every op of this crate, by name. One line each; what is not here does not build.
 
 use std::any::Any;
+use std::marker::PhantomData;
 
+use super::apply::execute;
 use super::attention::{factorised, relative_position};
 use super::case::{Case, Input};
 use super::conv::{conv2d, depthwise, transpose, upsampled};
@@ -14,13 +16,33 @@ use super::op::{Op, Registered};
 use super::product::{cross, linear, matmul};
 use super::reduce::{cross_entropy, cumulative, log_softmax, log_sum_exp, norm, prod, softmax, sum, variance};
 use super::{ShapeError, apply};
-use crate::tensor::{Shape, Var};
+use crate::tensor::{Float, Shape, Signature, Var};
+
+/// What runs an op in one element type.
+type Run<O, T> = fn(O, &[&Var<T>]) -> Result<Vec<Var<T>>, String>;
+
+/// [`Run`] for both.
+struct Runs<O>(PhantomData<O>);
+
+impl<O> Signature for Runs<O> {
+    type Of<T: Float> = Run<O, T>;
+}
 
 /// Makes the list of all ops and, in the same breath, lets each of them be an [`Op`].
 macro_rules! registry {
     ($($name:literal => $op:ty),* $(,)?) => {
         $(impl Registered for $op {
             const NAME: &'static str = $name;
+
+            fn run<T: Float>(self, inputs: &[&Var<T>]) -> Result<Vec<Var<T>>, String>
+            where
+                Self: Op<T>,
+            {
+                // The two instances exist in this crate, whoever calls.
+                static SINGLE: Run<$op, f32> = execute;
+                static DOUBLE: Run<$op, f64> = execute;
+                T::pick::<Runs<$op>>(SINGLE, DOUBLE)(self, inputs)
+            }
         })*
 
         /// Every op of this crate.
@@ -121,7 +143,7 @@ pub struct Entry {
 }
 
 impl Entry {
-    /// An op, of this crate or a [`CustomOp`].
+    /// An op, of this crate or a [`CustomOp`](super::CustomOp).
     pub fn of<O: Op<f64> + Op<f32>>() -> Self {
         Entry {
             name: O::NAME,

@@ -3,6 +3,7 @@
 use std::fmt;
 use std::sync::Arc;
 
+use super::compiled::compiled;
 use super::float::Float;
 use super::pool::Buffer;
 use super::shape::Shape;
@@ -47,6 +48,11 @@ impl<T: Float> Tensor<T> {
         let shape = shape.into();
         let mut buffer = Buffer::stale(shape.len());
         fill(&mut buffer);
+        Self::over(shape, buffer)
+    }
+
+    /// Not a part of [`build`](Tensor::build), which is compiled for every kernel.
+    fn over(shape: Shape, buffer: Buffer<T>) -> Self {
         Tensor { shape, buffer: Arc::new(buffer) }
     }
 
@@ -198,18 +204,30 @@ impl<T: Float> Tensor<T> {
     #[track_caller]
     pub fn add_assign(&mut self, other: &Tensor<T>) {
         assert_eq!(self.shape, other.shape, "add_assign");
-        self.data_mut().iter_mut().zip(other.data()).for_each(|(a, &b)| *a += b);
+        add(self.data_mut(), other.data());
     }
 
     /// Whether every element is finite.
     pub fn is_finite(&self) -> bool {
-        // x * 0 is 0 unless x is infinite or NaN; the sum has no branches, and vectorises.
-        self.data().chunks(4096).all(|c| c.iter().map(|&x| x * T::ZERO).sum::<T>() == T::ZERO)
+        is_finite(self.data())
     }
 
     /// Whether both have the same shape and the same bits.
     pub fn same_bits(&self, other: &Tensor<T>) -> bool {
         self.shape == other.shape && self.data().iter().zip(other.data()).all(|(a, b)| a.bits() == b.bits())
+    }
+}
+
+compiled! {
+    fn add<T>(sum: &mut [T], x: &[T]) {
+        sum.iter_mut().zip(x).for_each(|(a, &b)| *a += b);
+    }
+}
+
+compiled! {
+    fn is_finite<T>(x: &[T]) -> bool {
+        // x * 0 is 0 unless x is infinite or NaN; the sum has no branches, and vectorises.
+        x.chunks(4096).all(|c| c.iter().map(|&x| x * T::ZERO).sum::<T>() == T::ZERO)
     }
 }
 

@@ -4,6 +4,7 @@ use std::fmt::{Debug, Display};
 use std::iter::Sum;
 use std::ops::{Add, AddAssign, Div, DivAssign, Mul, MulAssign, Neg, Sub, SubAssign};
 
+use super::compiled::Signature;
 use super::gemm::Gemm;
 use super::pool::Pool;
 use super::simd::Vector;
@@ -87,6 +88,9 @@ pub trait Float:
     fn bits(self) -> u64;
     #[doc(hidden)]
     fn pool() -> &'static Pool<Self>;
+    /// The function for this type, of the two for `f32` and `f64`.
+    #[doc(hidden)]
+    fn pick<S: Signature>(single: S::Of<f32>, double: S::Of<f64>) -> S::Of<Self>;
 
     /// The larger of two; NaN if either is.
     #[inline(always)]
@@ -226,6 +230,9 @@ impl Float for f32 {
         static POOL: Pool<f32> = Pool::new();
         &POOL
     }
+    fn pick<S: Signature>(single: S::Of<f32>, _: S::Of<f64>) -> S::Of<f32> {
+        single
+    }
 }
 
 impl Float for f64 {
@@ -306,6 +313,9 @@ impl Float for f64 {
     fn pool() -> &'static Pool<f64> {
         static POOL: Pool<f64> = Pool::new();
         &POOL
+    }
+    fn pick<S: Signature>(_: S::Of<f32>, double: S::Of<f64>) -> S::Of<f64> {
+        double
     }
 }
 

@@ -64,11 +64,17 @@ impl<'a, T: Float> GradSink<'a, T> {
     /// Lets a kernel write the gradient of input `i` where it belongs: over stale values with [`Accum::Replace`], or
     /// onto what is there with [`Accum::Add`]. Not called if nobody wants it.
     pub fn accumulate(&mut self, i: usize, kernel: impl FnOnce(&mut [T], Accum)) {
-        let Some(slot) = self.inputs.get(i).copied().flatten() else { return };
-        match &mut self.slots[slot] {
-            Some(sum) => kernel(sum.data_mut(), Accum::Add),
-            empty => *empty = Some(Tensor::build(self.shapes[slot], |out| kernel(out, Accum::Replace))),
+        if let Some((out, accum)) = self.place(i) {
+            kernel(out, accum);
         }
+    }
+
+    /// Where the gradient of input `i` belongs, and whether there is one already.
+    fn place(&mut self, i: usize) -> Option<(&mut [T], Accum)> {
+        let slot = self.inputs.get(i).copied().flatten()?;
+        let accum = if self.slots[slot].is_some() { Accum::Add } else { Accum::Replace };
+        let gradient = self.slots[slot].get_or_insert_with(|| Tensor::build(self.shapes[slot], |_| ()));
+        Some((gradient.data_mut(), accum))
     }
 }
 

@@ -3,6 +3,7 @@
 //! | file | idea |
 //! |---|---|
 //! | [`shape`] | extents, row-major strides, broadcasting |
+//! | `compiled` | kernels compiled once, for both element types |
 //! | [`float`] | `f32` to train in, `f64` to check in |
 //! | [`pool`] | buffers that are reused, not allocated |
 //! | `data` | [`Tensor`]: a shape over shared memory |
@@ -15,6 +16,7 @@
 //! | [`simd`] | run-time choice of instruction set |
 //! | [`profile`] | what ran, and how long |
 
+mod compiled;
 mod data;
 pub mod float;
 pub mod gemm;
@@ -29,6 +31,7 @@ pub mod simd;
 pub mod tape;
 pub mod var;
 
+pub use compiled::Signature;
 pub use data::Tensor;
 pub use float::Float;
 pub use gemm::Accum;

@@ -3,8 +3,8 @@
 //! | op family | idea |
 //! |---|---|
 //! | [`shape_ops`] | reshape and permute |
-//! | [`concat`] | tensors one after the other |
-//! | [`slice`] | a range along an axis |
+//! | [`mod@concat`] | tensors one after the other |
+//! | [`mod@slice`] | a range along an axis |
 //! | [`repeat`] | copies along an axis |
 //! | [`flip`] | reversed order along an axis |
 //! | [`index_select`] | whole slices by index |

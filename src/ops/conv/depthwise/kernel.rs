@@ -4,6 +4,8 @@
 //! and values) is convolved where it lies. Channels go in blocks of one vector register; the last block overlaps the one
 //! before it where the count is no multiple, and only its new channels are written.
 
+use std::ops::Range;
+
 use pulp::{Simd, WithSimd};
 
 use crate::ops::product::linear::sum_into;
@@ -521,30 +523,29 @@ impl<T: Float> Weigh<'_, T> {
         let (image, row) = (at / self.pass.height, at % self.pass.height);
         let (ky_from, ky_to) = self.pass.window.taps(row, height, kh);
         let line = |ky: usize| (image * height + row * stride + ky - padding) * width;
-        if ([kh, kw], ky_from, ky_to) == ([3, 3], 0, 3) {
-            // All nine taps at once: three sums alone would wait for one another.
-            let lines = [line(0), line(1), line(2)];
-            return match stride {
-                1 => self.taps::<S, PART, 3, 3, 1>(simd, block, at, 0, lines),
-                2 => self.taps::<S, PART, 3, 3, 2>(simd, block, at, 0, lines),
-                _ => lines.into_iter().enumerate().for_each(|(ky, line)| {
-                    self.singles(simd, block, at, ky, line, 0, self.pass.width);
-                }),
+        // All nine taps at once where they meet the image: three sums alone would wait for one another.
+        let rows = if ([kh, kw], ky_from, ky_to) == ([3, 3], 0, 3) && stride <= 2 { 3 } else { 1 };
+        for ky in (ky_from..ky_to).step_by(rows) {
+            let tiled = match (rows, kw, stride) {
+                (3, _, 1) => self.taps::<S, PART, 3, 3, 1>(simd, block, at, ky, [line(0), line(1), line(2)]),
+                (3, _, _) => self.taps::<S, PART, 3, 3, 2>(simd, block, at, ky, [line(0), line(1), line(2)]),
+                (_, 3, 1) => self.taps::<S, PART, 1, 3, 1>(simd, block, at, ky, [line(ky)]),
+                (_, 3, 2) => self.taps::<S, PART, 1, 3, 2>(simd, block, at, ky, [line(ky)]),
+                (_, 5, 1) => self.taps::<S, PART, 1, 5, 1>(simd, block, at, ky, [line(ky)]),
+                (_, 7, 1) => self.taps::<S, PART, 1, 7, 1>(simd, block, at, ky, [line(ky)]),
+                _ => 0..0,
             };
-        }
-        for ky in ky_from..ky_to {
-            match (kw, stride) {
-                (3, 1) => self.taps::<S, PART, 1, 3, 1>(simd, block, at, ky, [line(ky)]),
-                (3, 2) => self.taps::<S, PART, 1, 3, 2>(simd, block, at, ky, [line(ky)]),
-                (5, 1) => self.taps::<S, PART, 1, 5, 1>(simd, block, at, ky, [line(ky)]),
-                (7, 1) => self.taps::<S, PART, 1, 7, 1>(simd, block, at, ky, [line(ky)]),
-                _ => self.singles(simd, block, at, ky, line(ky), 0, self.pass.width),
+            // What the tiles leave: the borders, or everything.
+            for ky in ky..ky + rows {
+                for columns in [0..tiled.start, tiled.end..self.pass.width] {
+                    self.singles(simd, block, at, ky, line(ky), columns);
+                }
             }
         }
     }
 
     /// `R` rows of taps from `ky` on over a row of the output, one sum in a register for each tap; `lines` are the
-    /// first pixels of the rows of x that they meet.
+    /// first pixels of the rows of x that they meet. Returns the columns of the output that this covers.
     #[inline(always)]
     fn taps<S: Simd, const PART: bool, const R: usize, const K: usize, const STRIDE: usize>(
         &mut self,
@@ -553,7 +554,7 @@ impl<T: Float> Weigh<'_, T> {
         at: usize,
         ky: usize,
         lines: [usize; R],
-    ) {
+    ) -> Range<usize> {
         let (c, step, width, padding) = (self.x.cols, self.x.row_stride, self.pass.width, self.pass.window.padding);
         let (from, to) = self.pass.window.interior(width);
         let mut sums = [[T::splat(simd, T::ZERO); K]; R];
@@ -576,15 +577,11 @@ impl<T: Float> Weigh<'_, T> {
                 block.store(simd, self.dw, ((ky + r) * K + kx) * c, sum, Accum::Add);
             }
         }
-        for (r, line) in lines.into_iter().enumerate() {
-            self.singles(simd, block, at, ky + r, line, 0, from);
-            self.singles(simd, block, at, ky + r, line, tiled, width);
-        }
+        from..tiled
     }
 
     /// A row of taps at single outputs, those taps that meet the image.
     #[inline(always)]
-    #[expect(clippy::too_many_arguments, reason = "the parts of one loop nest")]
     fn singles<S: Simd, const PART: bool>(
         &mut self,
         simd: S,
@@ -592,12 +589,11 @@ impl<T: Float> Weigh<'_, T> {
         at: usize,
         ky: usize,
         line: usize,
-        from: usize,
-        to: usize,
+        columns: Range<usize>,
     ) {
         let Window { stride, kernel: [_, kw], width, padding, .. } = self.pass.window;
         let c = self.x.cols;
-        for ox in from..to {
+        for ox in columns {
             let g = block.load(simd, self.g.data, (at * self.pass.width + ox) * self.g.row_stride);
             let (kx_from, kx_to) = self.pass.window.taps(ox, width, kw);
             for kx in kx_from..kx_to {
