@@ -8,8 +8,8 @@ use parallax::monovit::Preset;
 use parallax::nn::Context;
 use parallax::street::{Street, StreetConfig};
 use parallax::tensor::Var;
+use parallax::train::RunConfig;
 use parallax::train::Trainer;
-use parallax::train::run::RunConfig;
 
 fn benches(c: &mut Criterion) {
     rayon::ThreadPoolBuilder::new().use_current_thread().build_global().expect("the first pool of this process");

@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use parallax::monovit::{Ablation, MonoVit, Preset};
-use parallax::train::run::{RunConfig, write_weights};
+use parallax::train::RunConfig;
+use parallax::train::run::write_weights;
 
 fn parallax(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_parallax")).args(arguments).output().expect("the program runs")

@@ -12,7 +12,8 @@ use parallax::formats::pth;
 use parallax::formats::pth::Saved;
 use parallax::monovit::{MonoVit, Preset};
 use parallax::nn::Params;
-use parallax::train::run::{RunConfig, load_weights};
+use parallax::train::RunConfig;
+use parallax::train::run::load_weights;
 use parallax::train::start::Start;
 use parallax::weights::{Form, Need, Sources, Weights, load, preset_of, save};
 

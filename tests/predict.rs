@@ -12,7 +12,8 @@ use parallax::eval::predictor::Predictor;
 use parallax::monovit::{MonoVit, Preset};
 use parallax::nn::Context;
 use parallax::tensor::{Tensor, Var, parallel, pool};
-use parallax::train::run::{RunConfig, load_weights, write_weights};
+use parallax::train::RunConfig;
+use parallax::train::run::{load_weights, write_weights};
 
 /// The size that the network of these tests was made for.
 const HEIGHT: u32 = 64;

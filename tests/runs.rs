@@ -9,8 +9,10 @@ use parallax::data::Dataset;
 use parallax::monovit::Preset;
 use parallax::monovit::loss::{Reprojection, Scales};
 use parallax::street::{Street, StreetConfig};
+use parallax::train::RunConfig;
+use parallax::train::recipe::read_config;
 use parallax::train::rotations::Shake;
-use parallax::train::run::{Ended, Event, Run, RunConfig, RunData, load_weights, read_config};
+use parallax::train::run::{Ended, Event, Run, RunData, load_weights};
 
 fn street(seed: u64) -> Arc<dyn Dataset> {
     let config = StreetConfig { height: 64, width: 96, sequences: 1, frames: 8, seed, ..StreetConfig::default() };

@@ -13,8 +13,8 @@ use parallax::monovit::Preset;
 use parallax::ops::registry::{self, AnyCase};
 use parallax::street::{Street, StreetConfig};
 use parallax::tensor::{Float, Tape, Tensor, Var, simd};
+use parallax::train::RunConfig;
 use parallax::train::Trainer;
-use parallax::train::run::RunConfig;
 
 /// Where the process of a level leaves its numbers.
 const OUT: &str = "PARALLAX_SIMD_TEST_OUT";

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use parallax::train::run::check_size;
+use parallax::train::recipe::check_size;
 use parallax::weights;
 use parallax::weights::{Form, Need};
 use parallax::{Error, Result};

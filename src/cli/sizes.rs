@@ -2,7 +2,7 @@
 
 use parallax::Result;
 use parallax::monovit::Preset;
-use parallax::train::run::check_size;
+use parallax::train::recipe::check_size;
 
 #[derive(clap::Args, Clone)]
 pub struct Sizes {

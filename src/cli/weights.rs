@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use parallax::Result;
-use parallax::train::run::check_size;
+use parallax::train::recipe::check_size;
 use parallax::weights;
 use parallax::weights::{Need, Weights};
 

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use super::run::RunConfig;
+use super::recipe::RunConfig;
 use crate::error::Result;
 use crate::monovit::{Ablation, MonoVit};
 use crate::nn::{Params, Report};

@@ -31,7 +31,7 @@ use std::path::PathBuf;
 use crate::error::Result;
 use crate::monovit::{Ablation, MonoVit, Preset};
 use crate::nn::{Params, Report};
-use crate::train::run::RunConfig;
+use crate::train::RunConfig;
 
 /// A model with weights from files.
 pub struct Weights {

@@ -11,7 +11,7 @@ use crate::formats::pth::shown;
 use crate::monovit::Preset;
 use crate::monovit::loss::LossConfig;
 use crate::nn::{Named, Params, Report, Skipped, fit};
-use crate::train::run::{RunConfig, check_size};
+use crate::train::recipe::{RunConfig, check_size};
 
 /// Which of the four networks have to be there. One that is there at all has to be there whole.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

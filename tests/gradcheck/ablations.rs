@@ -10,8 +10,8 @@ use parallax::nn::Params;
 use parallax::ops::registry;
 use parallax::street::{Street, StreetConfig};
 use parallax::tensor::profile;
+use parallax::train::RunConfig;
 use parallax::train::Trainer;
-use parallax::train::run::RunConfig;
 
 use super::whole_model::assert_taylor;
 

@@ -10,8 +10,8 @@ use parallax::ops::registry;
 use parallax::street::{Street, StreetConfig};
 use parallax::tensor::parallel;
 use parallax::tensor::profile;
+use parallax::train::RunConfig;
 use parallax::train::Trainer;
-use parallax::train::run::RunConfig;
 
 fn street(height: usize, width: usize) -> Street {
     Street::render(&StreetConfig { height, width, sequences: 1, frames: 6, ..StreetConfig::default() }, None)

@@ -11,7 +11,7 @@ use parallax::nn::{Context, Folded, Named, fit};
 use parallax::ops::Conv2d;
 use parallax::random::Random;
 use parallax::tensor::{Tape, Tensor, Var};
-use parallax::train::run::check_size;
+use parallax::train::recipe::check_size;
 use parallax::{Error, Result};
 use serde::Serialize;
 

@@ -10,8 +10,8 @@ use parallax::random::Random;
 use parallax::tensor::profile;
 use parallax::tensor::profile::Profile;
 use parallax::tensor::{Shape, Tensor, Var, pool};
+use parallax::train::RunConfig;
 use parallax::train::Trainer;
-use parallax::train::run::RunConfig;
 
 use super::Sizes;
 

@@ -5,6 +5,7 @@
 //! Along the last dimension a block has a single column, which is contiguous.
 
 use super::sum::{cut, sum_rows};
+use crate::ops::support::put::put;
 use crate::tensor::pool::Buffer;
 use crate::tensor::{Accum, Float, Shape, parallel, simd};
 
@@ -160,15 +161,6 @@ fn map<T: Float, C: Copy>(out: &mut [T], accum: Accum, x: &[T], columns: &[C], f
     }
     for (out, x) in out.chunks_exact_mut(columns.len()).zip(x.chunks_exact(columns.len())) {
         put(accum, out.iter_mut().zip(x.iter().zip(columns).map(|(&x, &c)| f(x, c))));
-    }
-}
-
-/// Writes the numbers, or adds them.
-#[inline(always)]
-pub(in crate::ops) fn put<'a, T: Float>(accum: Accum, terms: impl Iterator<Item = (&'a mut T, T)>) {
-    match accum {
-        Accum::Replace => terms.for_each(|(d, x)| *d = x),
-        Accum::Add => terms.for_each(|(d, x)| *d += x),
     }
 }
 

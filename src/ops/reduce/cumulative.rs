@@ -1,6 +1,7 @@
 //! Running sums and products along an axis.
 
-use super::axis_loops::{Blocks, put};
+use super::axis_loops::Blocks;
+use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 

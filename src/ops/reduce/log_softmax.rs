@@ -1,7 +1,8 @@
 //! The logarithm of the softmax along any axis.
 
-use super::axis_loops::{Blocks, put};
+use super::axis_loops::Blocks;
 use super::log_sum_exp::{log_sums, maxima};
+use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 

@@ -1,8 +1,9 @@
 //! Euclidean lengths, and vectors brought to length 1.
 
-use super::axis_loops::{Blocks, put};
+use super::axis_loops::Blocks;
 use super::sum::dropped;
 use crate::ops::normalise::layer_norm::sum;
+use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::pool::Buffer;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};

@@ -1,7 +1,8 @@
 //! Products along dimensions.
 
-use super::axis_loops::{Blocks, put};
+use super::axis_loops::Blocks;
 use super::sum::dropped;
+use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 

@@ -2,3 +2,4 @@
 
 pub(in crate::ops) mod epilogue;
 pub(in crate::ops) mod indices;
+pub(in crate::ops) mod put;
