@@ -2,7 +2,7 @@
 //! do not depend on how many threads there were.
 
 use std::cell::RefCell;
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Where the chunks of a kernel run.
 #[derive(Clone, Default)]
@@ -94,15 +94,19 @@ fn run<T: Send>(data: &mut [T], chunk: usize, work: usize, f: &(dyn Fn(usize, &m
 /// Calls `f(i)` for every i below `count`, on all threads. `work` is a rough count of elementary operations: below
 /// [`WORTHWHILE`] everything stays on the calling thread.
 pub fn for_each(count: usize, work: usize, f: impl Fn(usize) + Sync + Send) {
-    // Nothing to be cut but the indices.
+    indices(count, work, &f);
+}
+
+/// Nothing to be cut but the indices: the threads' machinery is compiled once for all that runs by index.
+fn indices(count: usize, work: usize, f: &(dyn Fn(usize) + Sync)) {
     run(&mut vec![(); count], 1, work, &|i, _| f(i));
 }
 
 /// Collects `f(i)` for every i below `count`, in order.
 pub fn map<R: Send>(count: usize, work: usize, f: impl Fn(usize) -> R + Sync + Send) -> Vec<R> {
-    let mut results: Vec<Option<R>> = (0..count).map(|_| None).collect();
-    run(&mut results, 1, work, &|i, result| result[0] = Some(f(i)));
-    results.into_iter().flatten().collect()
+    let results: Vec<Mutex<Option<R>>> = (0..count).map(|_| Mutex::new(None)).collect();
+    indices(count, work, &|i| *lock(&results[i]) = Some(f(i)));
+    results.into_iter().filter_map(|r| r.into_inner().unwrap_or_else(PoisonError::into_inner)).collect()
 }
 
 /// Cuts `data` into chunks of `chunk` elements (the last may be shorter) and calls `f(index, chunk)` for each.
@@ -112,8 +116,17 @@ pub fn for_each_chunk<T: Send>(data: &mut [T], chunk: usize, work: usize, f: imp
 
 /// Calls `f` for every piece: for kernels that write several slices, cut and zipped by the caller.
 pub fn for_each_piece<P: Send>(pieces: impl IntoIterator<Item = P>, work: usize, f: impl Fn(P) + Sync + Send) {
-    let mut pieces: Vec<Option<P>> = pieces.into_iter().map(Some).collect();
-    run(&mut pieces, 1, work, &|_, piece| piece.iter_mut().filter_map(Option::take).for_each(&f));
+    // Each is taken once, so no thread waits for a lock.
+    let pieces: Vec<Mutex<Option<P>>> = pieces.into_iter().map(|p| Mutex::new(Some(p))).collect();
+    indices(pieces.len(), work, &|i| {
+        let piece = lock(&pieces[i]).take();
+        piece.into_iter().for_each(&f);
+    });
+}
+
+/// A lock of which nobody keeps a broken half: a panic of another thread is reported by that thread.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Elementary operations below which handing work over costs more than it saves.

@@ -202,7 +202,10 @@ impl<T: Float> Product<'_, T> {
                     (terms, accum) = (0, Accum::Add);
                 }
                 terms += count;
-                let a: [&[T]; P] = std::array::from_fn(|p| &data[(at + p) * step + from..][..count]);
+                let mut a: [&[T]; P] = [&[]; P];
+                for (p, a) in a.iter_mut().enumerate() {
+                    *a = &data[(at + p) * step + from..][..count];
+                }
                 let b = &panel[(above + from) * width..];
                 // The same twice: only where it is known that rows follow each other is nothing checked in the loop.
                 if DENSE {
@@ -274,11 +277,14 @@ fn multiply<T: Float, S: Simd, const P: usize, const N: usize>(
     j: usize,
     b: &[T],
 ) {
-    let b: [_; N] = std::array::from_fn(|q| T::load(simd, &b[q * T::lanes::<S>()..]));
+    let mut row = [T::splat(simd, T::ZERO); N];
+    for (q, row) in row.iter_mut().enumerate() {
+        *row = T::load(simd, &b[q * T::lanes::<S>()..]);
+    }
     for p in 0..P {
         let x = T::splat(simd, a[p][j]);
         for q in 0..N {
-            sums[p][q] = T::fma(simd, x, b[q], sums[p][q]);
+            sums[p][q] = T::fma(simd, x, row[q], sums[p][q]);
         }
     }
 }
@@ -346,14 +352,15 @@ impl<T: Float> Gram<'_, T> {
             for i in 0..self.count {
                 let a = &a[i * self.a_step + at..][..P];
                 let b = &b[i * self.b_step + first..][..width];
-                let b: [_; N] = std::array::from_fn(|q| {
+                let mut row = [T::splat(simd, T::ZERO); N];
+                for (q, row) in row.iter_mut().enumerate() {
                     let b = &b[q * lanes..];
-                    if PART && q + 1 == N { T::load_part(simd, b) } else { T::load(simd, b) }
-                });
+                    *row = if PART && q + 1 == N { T::load_part(simd, b) } else { T::load(simd, b) };
+                }
                 for p in 0..P {
                     let x = T::splat(simd, a[p]);
                     for q in 0..N {
-                        sums[p][q] = T::fma(simd, x, b[q], sums[p][q]);
+                        sums[p][q] = T::fma(simd, x, row[q], sums[p][q]);
                     }
                 }
             }
