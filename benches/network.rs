@@ -16,10 +16,10 @@ fn benches(c: &mut Criterion) {
     let street = Street::render(&StreetConfig { sequences: 1, frames: 6, ..StreetConfig::default() }, None);
     let mut config = RunConfig::new(Preset::Nano, 1_000_000);
     // The step as it is for most of the run.
-    config.loss.auto_mask_after = 0;
-    config.loss.shake.keep = 0;
+    config.auto_mask_delay = 0.0;
+    config.rotations.keep = 0.0;
     let batch = batch_of_step(&street, Augment::default(), 4, 0, 0).expect("a batch");
-    let mut trainer = Trainer::new(config.model(), config.optim, config.loss, 0);
+    let mut trainer = Trainer::new(config.model(), config.plan());
     let mut group = c.benchmark_group("nano 320x96, batch 4");
     group.sample_size(10);
     group.bench_function("inference", |b| {

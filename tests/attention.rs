@@ -22,7 +22,7 @@ impl Place {
         let folder = tempfile::tempdir().expect("a folder");
         let config = RunConfig { height: 64, width: 96, ablation, ..RunConfig::new(Preset::Pico, 10) };
         let (_, params) = MonoVit::new(config.model(), 1);
-        write_weights(&folder.path().join("weights.safetensors"), &params, &config).expect("written");
+        write_weights(&folder.path().join("weights.safetensors"), &params, &config.setup()).expect("written");
         let picture = image::RgbImage::from_fn(130, 70, |x, y| image::Rgb([x as u8, 2 * y as u8, (x * y % 251) as u8]));
         picture.save(folder.path().join("street.png")).expect("written");
         Place { folder }
@@ -117,7 +117,7 @@ fn fails(output: Output, status: i32, words: &[&str]) {
 #[test]
 fn what_cannot_be_is_named_before_anything_is_computed() {
     let place = Place::new(Ablation::default());
-    fails(place.run("130,10", &[]), 1, &["--at", "130,10", "130x70", "0 to 129", "0 to 69"]);
+    fails(place.run("130,10", &[]), 2, &["--at", "130,10", "130x70", "0 to 129", "0 to 69"]);
     fails(place.run("10", &[]), 2, &["--at", "320,96"]);
     fails(place.run("-1,5", &[]), 2, &["--at"]);
     assert!(!Path::new(&place.path("out")).exists(), "nothing was made");

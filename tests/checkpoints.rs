@@ -70,10 +70,9 @@ fn every_arrangement_gives_the_same_weights() {
     for (what, paths, size) in cases {
         let weights = load(&paths, Need::All, false).unwrap_or_else(|e| panic!("{what}: {e}"));
         assert_weights(&weights.params, &ALL, what);
-        assert_eq!(weights.config.preset, Preset::Pico, "{what}");
-        assert_eq!((weights.config.height, weights.config.width), size, "{what}");
-        let loss = weights.config.loss;
-        assert_eq!((loss.min_depth, loss.max_depth), (0.1, 100.0), "{what}");
+        assert_eq!(weights.setup.preset, Preset::Pico, "{what}");
+        assert_eq!((weights.setup.height, weights.setup.width), size, "{what}");
+        assert_eq!((weights.setup.min_depth, weights.setup.max_depth), (0.1, 100.0), "{what}");
         assert_eq!(weights.report.problem(), None, "{what}");
         assert_eq!(weights.report.matched.len(), weights.params.len(), "{what}");
         let heads = weights.report.skipped.iter().filter(|s| s.what.contains("head")).count();
@@ -104,7 +103,7 @@ fn every_form_gives_back_what_was_written() {
         save(&weights, &path, Form::of(&path).expect("a form")).expect("written");
         let again = load(std::slice::from_ref(&path), Need::All, false).unwrap_or_else(|e| panic!("{name}: {e}"));
         assert_weights(&again.params, &ALL, name);
-        assert_eq!((again.config.height, again.config.width), (64, 96), "{name}");
+        assert_eq!((again.setup.height, again.setup.width), (64, 96), "{name}");
         // And from there to every other form.
         for next in ["b.safetensors", "b.npz", "b.pth", "other"] {
             let path = place.path().join(format!("from_{name}_{next}"));

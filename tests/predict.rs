@@ -27,7 +27,7 @@ fn weights() -> &'static Path {
         let usual = RunConfig::new(Preset::Pico, 1);
         let config = RunConfig { height: HEIGHT as usize, width: WIDTH as usize, ..usual };
         let (_, params) = MonoVit::new::<f32>(config.model(), 11);
-        write_weights(&path, &params, &config).expect("weights");
+        write_weights(&path, &params, &config.setup()).expect("weights");
         path
     })
 }
@@ -291,8 +291,8 @@ fn wrong_usage_is_named() {
     fails(&go(&["--fov", "60", "--intrinsics", "1,1,1,1"]), 2, &["--fov", "--intrinsics"]);
     fails(&go(&["--scale", "0"]), 2, &["--scale", "above 0"]);
     fails(&go(&["--intrinsics", "1,2"]), 2, &["--intrinsics", "four numbers"]);
-    fails(&go(&["--height", "100"]), 1, &["--height", "100", "multiple of 32"]);
-    fails(&go(&["--width", "32"]), 1, &["--width", "32"]);
+    fails(&go(&["--height", "100"]), 2, &["--height", "100", "multiple of 32"]);
+    fails(&go(&["--width", "32"]), 2, &["--width", "32"]);
     assert!(!out.exists(), "nothing was made");
     fails(&run(weights(), &[&path], &path.join("inside"), &[]), 1, &["a.png"]);
 }
@@ -373,7 +373,7 @@ fn predicting_records_nothing_and_reuses_its_memory() {
     let outputs = model.disparities(&Context::inference(&params), &input);
     assert!(outputs.iter().all(|d| !d.is_tracked() && d.tape().is_none()));
     drop(outputs);
-    let predictor = Predictor::new(&model, &params, &config.loss);
+    let predictor = Predictor::new(&model, &params, &config);
     let fresh = || {
         let before = pool::fresh_buffers();
         predictor.inverse_depth(&picture(WIDTH, HEIGHT), true);

@@ -11,7 +11,7 @@ use parallax::monovit::loss::{Reprojection, Scales};
 use parallax::street::{Street, StreetConfig};
 use parallax::train::RunConfig;
 use parallax::train::recipe::read_config;
-use parallax::train::rotations::Shake;
+use parallax::train::rotations::Rotations;
 use parallax::train::run::{Ended, Event, Run, RunData, load_weights};
 
 fn street(seed: u64) -> Arc<dyn Dataset> {
@@ -25,7 +25,7 @@ fn data() -> RunData {
 
 fn config() -> RunConfig {
     let mut usual = RunConfig::new(Preset::Pico, 5);
-    usual.loss.shake = Shake { steps: 2, keep: 2, ..Shake::default() };
+    usual.rotations = Rotations { share: 0.4, keep: 0.4, ..Rotations::default() };
     RunConfig { height: 64, width: 96, batch: 2, log_every: 1, checkpoint_every: 2, ..usual }
 }
 
@@ -101,12 +101,12 @@ fn wrong_settings_are_named_before_any_time_is_spent() {
     let place = tempfile::tempdir().expect("a folder");
     let out = place.path().join("run");
     let out = out.to_str().expect("a path in UTF-8");
-    fails(&["train", "--height", "100", "--out", out], 1, &["--height", "100", "multiple of 32", "96"]);
-    fails(&["train", "--steps", "0", "--out", out], 1, &["--steps"]);
+    fails(&["train", "--height", "100", "--out", out], 2, &["--height", "100", "multiple of 32", "96"]);
+    fails(&["train", "--steps", "0", "--out", out], 2, &["--steps"]);
     fails(&["train", "--stepz", "1"], 2, &["--stepz"]);
     fails(&["train", "--data", "/no/such/folder", "--out", out], 1, &["/no/such/folder"]);
     fails(&["train", "--resume", "/no/such/run"], 1, &["/no/such/run"]);
-    fails(&["gradcheck", "--op", "nonsense"], 1, &["--op", "conv2d"]);
+    fails(&["gradcheck", "--op", "nonsense"], 2, &["--op", "conv2d"]);
     assert!(!Path::new(out).exists(), "nothing was made");
 }
 
@@ -136,7 +136,7 @@ fn flags_of_ablations_win_over_the_configuration_and_are_written_into_the_run() 
     let size = ["--sequences", "1", "--frames", "14", "--height", "64", "--width", "96"];
     assert!(parallax(&[&["data", "street", "--out", &street][..], &size].concat()).status.success());
     let mut shorter = config();
-    (shorter.steps, shorter.loss.shake.steps, shorter.data) = (1, 0, street);
+    (shorter.steps, shorter.rotations.share, shorter.data) = (1, 0.0, street);
     std::fs::write(path("config.toml"), toml::to_string(&shorter).expect("TOML")).expect("written");
     let (config, run) = (path("config.toml"), path("run"));
     let networks = ["--transformer-paths", "1", "--no-decoder-attention", "--drop-path", "0.5"];
@@ -151,9 +151,9 @@ fn flags_of_ablations_win_over_the_configuration_and_are_written_into_the_run() 
     // The weights remember what they were made for.
     let (model, ..) = load_weights(&place.path().join("run")).expect("weights");
     assert_eq!(model.config, written.model());
-    fails(&["train", "--ssim", "2", "--out", &path("no")], 1, &["loss.ssim", "2"]);
-    fails(&["train", "--transformer-paths", "7", "--out", &path("no")], 1, &["transformer_paths", "7"]);
-    fails(&["info", "--transformer-paths", "0", "--no-cnn-path"], 1, &["cnn_path", "neither"]);
+    fails(&["train", "--ssim", "2", "--out", &path("no")], 2, &["--ssim", "2"]);
+    fails(&["train", "--transformer-paths", "7", "--out", &path("no")], 2, &["--transformer-paths", "7"]);
+    fails(&["info", "--transformer-paths", "0", "--no-cnn-path"], 2, &["cnn_path", "neither"]);
 }
 
 #[test]

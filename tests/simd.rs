@@ -75,8 +75,8 @@ fn losses() -> Numbers {
         None,
     );
     let mut config = RunConfig::new(Preset::Pico, 10);
-    (config.loss.auto_mask_after, config.loss.shake.keep) = (0, 0);
-    let mut trainer = Trainer::new(config.model(), config.optim, config.loss, 0);
+    (config.auto_mask_delay, config.rotations.keep) = (0.0, 0.0);
+    let mut trainer = Trainer::new(config.model(), config.plan());
     let batch = batch_of_step(&street, Augment::default(), 1, 0, 0).expect("a batch");
     let losses = (0..3).map(|_| trainer.step(&batch).expect("a finite loss").loss).collect();
     Numbers { what: "three training steps".into(), single: true, tensors: vec![losses] }

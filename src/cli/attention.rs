@@ -107,9 +107,9 @@ pub fn run(args: Args) -> Result<()> {
         return Err(Error::setting("--at", message));
     }
     check_writable(&args.out)?;
-    let (model, params, config) = load_weights(&args.weights)?;
+    let (model, params, setup) = load_weights(&args.weights)?;
     let picture = read_picture(&args.image)?;
-    let (height, width) = (config.height, config.width);
+    let (height, width) = (setup.height, setup.width);
     let seen = to_tensor(&[&lanczos(&picture, width as u32, height as u32)]);
     // The pixel's centre, at the size that the networks see.
     let scaled = |at: u32, from: u32, to: usize| ((f64::from(at) + 0.5) * to as f64 / f64::from(from)) as usize;

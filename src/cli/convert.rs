@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use parallax::train::recipe::check_size;
+use parallax::monovit::setup::check_size;
 use parallax::weights;
 use parallax::weights::{Form, Need};
 use parallax::{Error, Result};
@@ -39,8 +39,8 @@ pub fn run(args: Args) -> Result<()> {
     }
     let form = Form::of(&args.out)?;
     let mut weights = weights::load(&args.inputs, Need::Any, args.allow_partial)?;
-    weights.config.height = args.height.unwrap_or(weights.config.height);
-    weights.config.width = args.width.unwrap_or(weights.config.width);
+    weights.setup.height = args.height.unwrap_or(weights.setup.height);
+    weights.setup.width = args.width.unwrap_or(weights.setup.width);
     let outputs = weights::outputs(&weights, &args.out, form);
     if let (false, Some(there)) = (args.force, outputs.iter().find(|p| p.exists())) {
         return Err(Error::file(there, "is there already: --force replaces it (OUT is the last argument)"));

@@ -73,6 +73,6 @@ pub fn run(args: Args) -> Result<()> {
     if let Ok(progress) = progress.lock() {
         progress.finish();
     }
-    eprintln!("wrote {} sequences of {} frames to {}", a.sequences, a.frames, a.out.display());
+    note!("wrote {} sequences of {} frames to {}", a.sequences, a.frames, a.out.display());
     Ok(())
 }

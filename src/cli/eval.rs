@@ -40,8 +40,8 @@ pub struct Args {
 }
 
 pub fn run(args: Args) -> Result<()> {
-    let Weights { model, params, config, .. } = args.weights.load()?;
-    let (height, width) = (config.height, config.width);
+    let Weights { model, params, setup, .. } = args.weights.load()?;
+    let (height, width) = (setup.height, setup.width);
     let data: Box<dyn Dataset> = if args.data == "street" {
         let street = StreetConfig { height, width, sequences: 8, seed: args.seed, ..StreetConfig::default() };
         Box::new(Street::render(&street, None))
@@ -55,7 +55,7 @@ pub fn run(args: Args) -> Result<()> {
         Box::new(Kitti::open(Path::new(&args.data), args.split.as_deref(), height, width, options)?)
     };
     let samples: Vec<usize> = (0..data.len()).collect();
-    let predictor = Predictor::new(&model, &params, &config.loss);
+    let predictor = Predictor::new(&model, &params, &setup);
     let mut progress = Progress::new("images", samples.len() as u64);
     let how = Evaluation { protocol: args.protocol, scale: args.scale, flip: args.flip };
     let report = evaluate(&predictor, data.as_ref(), &samples, how, |done| progress.set(done as u64, ""))?;

@@ -70,7 +70,7 @@ pub fn run(args: Args) -> Result<()> {
             row.milliseconds += start.elapsed().as_secs_f64() * 1e3;
             if found.report.failure().is_some() {
                 table.failed += 1;
-                eprintln!("{found}\n");
+                note!("{found}\n");
                 table.failures.push(found);
             }
         }

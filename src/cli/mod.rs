@@ -5,6 +5,11 @@ macro_rules! say {
     ($($text:tt)*) => { crate::cli::say(format_args!($($text)*)) };
 }
 
+/// A line on standard error: `note!` that never ends the work, whether or not anybody can still read it.
+macro_rules! note {
+    ($($text:tt)*) => { crate::cli::note(format_args!($($text)*)) };
+}
+
 mod ablation;
 mod attention;
 mod bench;
@@ -22,7 +27,7 @@ mod weights;
 
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use parallax::{Error, Result};
 
 /// Monocular depth without supervision, from scratch on the CPU: train MonoViT, predict depth, check every gradient.
@@ -60,7 +65,9 @@ enum Command {
 
 /// Runs the program.
 pub fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let matches = Cli::command().get_matches();
+    let subcommand = matches.subcommand_name().unwrap_or_default().to_owned();
+    let cli = Cli::from_arg_matches(&matches).unwrap_or_else(|e| e.exit());
     let ready = parallax::tensor::simd::level().and_then(|_| start_threads(cli.threads));
     let result = ready.and_then(|()| match cli.command {
         Command::Train(args) => train::run(*args),
@@ -75,11 +82,24 @@ pub fn main() -> ExitCode {
     });
     match result {
         Ok(()) => ExitCode::SUCCESS,
+        Err(Error::Setting { name, message }) => {
+            note!("parallax: {}: {message}", flag_of(&subcommand, &name));
+            ExitCode::from(2)
+        }
         Err(error) => {
-            eprintln!("parallax: {error}");
+            note!("parallax: {error}");
             ExitCode::FAILURE
         }
     }
+}
+
+/// A field of a setting as it is called on the command line, if it has a flag there: `loss.ssim` is `--ssim`.
+fn flag_of(subcommand: &str, field: &str) -> String {
+    let long = field.rsplit('.').next().unwrap_or(field).replace('_', "-");
+    let command = Cli::command();
+    let found =
+        command.find_subcommand(subcommand).is_some_and(|c| c.get_arguments().any(|a| a.get_long() == Some(&long)));
+    if found { format!("--{long}") } else { field.to_owned() }
 }
 
 /// The pool that kernels run in, with this thread as one of its workers: handing work over from outside a pool costs a
@@ -100,6 +120,12 @@ fn print_json(value: &impl serde::Serialize) -> Result<()> {
     Ok(())
 }
 
+/// Writes a line for `note!`. A terminal that is gone, or a full disk behind a log, is no reason to stop.
+fn note(text: std::fmt::Arguments) {
+    use std::io::Write;
+    let _ = writeln!(std::io::stderr(), "{text}");
+}
+
 /// Writes a line for `say!`. Nobody reads on when this ends the program, and all that was made is already written.
 fn say(text: std::fmt::Arguments) {
     use std::io::{ErrorKind, Write};
@@ -107,7 +133,7 @@ fn say(text: std::fmt::Arguments) {
         if error.kind() == ErrorKind::BrokenPipe {
             std::process::exit(0);
         }
-        eprintln!("parallax: standard output: {error}");
+        note!("parallax: standard output: {error}");
         std::process::exit(1);
     }
 }

@@ -163,10 +163,10 @@ struct Failure {
 pub fn run(args: Args) -> Result<()> {
     let started = Instant::now();
     let jobs = jobs(find_pictures(&args.inputs, &args.out)?, &args)?;
-    let Weights { model, params, config, .. } = args.weights.load()?;
+    let Weights { model, params, setup, .. } = args.weights.load()?;
     check_writable(&args.out)?;
-    let predictor = Predictor::new(&model, &params, &config.loss);
-    let size = (config.height, config.width);
+    let predictor = Predictor::new(&model, &params, &setup);
+    let size = (setup.height, setup.width);
     let mut progress = Progress::new("pictures", jobs.len() as u64);
     let (mut done, mut failed) = (Vec::new(), Vec::new());
     for (i, job) in jobs.into_iter().enumerate() {
@@ -186,7 +186,7 @@ pub fn run(args: Args) -> Result<()> {
         && done.len() > 1
         && let Some(factor) = median(done.iter().map(|picture| picture.factor).collect())
     {
-        eprintln!("the median factor is {factor:.3}: --scale {factor:.3} gives all pictures the same");
+        note!("the median factor is {factor:.3}: --scale {factor:.3} gives all pictures the same");
     }
     let (all, failures) = (done.len() + failed.len(), failed.len());
     if args.json {

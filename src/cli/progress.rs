@@ -45,13 +45,13 @@ impl Progress {
             let rate = (done - first) as f64 / start.elapsed().as_secs_f64().max(1e-9);
             let left = (self.total.saturating_sub(done)) as f64 / rate;
             let rate = if done > first { format!("{rate:.2}/s  {left:.0} s left") } else { "just begun".to_owned() };
-            eprintln!("{} {done}/{}  {rate}  {note}", self.what, self.total);
+            note!("{} {done}/{}  {rate}  {note}", self.what, self.total);
         }
     }
 
     /// A line above the bar.
     pub fn say(&self, line: &str) {
-        if self.plain { eprintln!("{line}") } else { self.bar.println(line) }
+        if self.plain { note!("{line}") } else { self.bar.println(line) }
     }
 
     /// Takes the bar away.

@@ -2,7 +2,7 @@
 
 use parallax::Result;
 use parallax::monovit::Preset;
-use parallax::train::recipe::check_size;
+use parallax::monovit::setup::check_size;
 
 #[derive(clap::Args, Clone)]
 pub struct Sizes {

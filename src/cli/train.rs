@@ -9,7 +9,7 @@ use parallax::data::{Dataset, Subset};
 use parallax::eval::metrics::Metrics;
 use parallax::monovit::Preset;
 use parallax::street::{Street, StreetConfig};
-use parallax::train::recipe::{RunConfig, read_config};
+use parallax::train::recipe::{RunConfig, STEPS, read_config};
 use parallax::train::run::{Ended, Event, Run, RunData, RunMetrics};
 use parallax::train::start::Start;
 use parallax::weights::preset_of;
@@ -17,9 +17,6 @@ use parallax::{Error, Result};
 
 use super::ablation;
 use super::progress::Progress;
-
-/// Steps of the default run.
-const STEPS: u64 = 3800;
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -95,7 +92,7 @@ pub fn run(args: Args) -> Result<()> {
         if asked.swap(true, Ordering::SeqCst) {
             std::process::exit(130);
         }
-        eprintln!("\nstopping after this step; once more to stop at once");
+        note!("\nstopping after this step; once more to stop at once");
     })
     .map_err(|e| Error::Failed(format!("Ctrl-C cannot be caught: {e}")))?;
 
@@ -112,9 +109,9 @@ pub fn run(args: Args) -> Result<()> {
             let start = Start::of(&config)?;
             for (files, report) in &start.reports {
                 let files: Vec<String> = files.iter().map(|f| f.display().to_string()).collect();
-                eprintln!("starting from {}", files.join(", "));
+                note!("starting from {}", files.join(", "));
                 if report.problem().is_some() {
-                    eprintln!("{report}");
+                    note!("{report}");
                 }
             }
             let folder = args.out.clone().unwrap_or_else(|| next_free("runs"));
@@ -124,7 +121,7 @@ pub fn run(args: Args) -> Result<()> {
                 enough(&data, &config)?;
                 if let Some(epochs) = args.epochs {
                     let a_pass = data.train.len().div_ceil(config.batch.max(1)) as u64;
-                    config.set_steps(epochs * a_pass);
+                    config.steps = epochs * a_pass;
                 }
                 Ok((Run::create_from(&folder, config, start)?, data))
             });
@@ -136,7 +133,7 @@ pub fn run(args: Args) -> Result<()> {
             })?
         }
     };
-    eprintln!(
+    note!(
         "training {} on {} samples, {} steps of {}; everything goes to {}",
         run.config.preset.name(),
         data.train.len(),
@@ -171,10 +168,10 @@ pub fn run(args: Args) -> Result<()> {
     let folder = run.folder.display();
     match ended {
         Ended::Interrupted(step) => {
-            eprintln!("stopped after step {step}; go on with: parallax train --resume {folder}");
+            note!("stopped after step {step}; go on with: parallax train --resume {folder}");
         }
         Ended::Finished(None) => {
-            eprintln!(
+            note!(
                 "done; no frame that was set aside has ground-truth depth to measure against. Look at {folder}/images"
             );
         }
@@ -183,22 +180,35 @@ pub fn run(args: Args) -> Result<()> {
                 super::print_json(&metrics)?;
             }
             print_metrics(&metrics);
-            eprintln!("done in {:.0} s; look at {folder}/images", metrics.seconds);
+            note!("done in {:.0} s; look at {folder}/images", metrics.seconds);
         }
     }
     Ok(())
 }
 
 fn print_metrics(m: &RunMetrics) {
-    eprintln!("\n{} images that nothing was chosen on ({})", m.images, m.test);
-    eprintln!(
+    note!("\n{} images that nothing was chosen on ({})", m.images, m.test);
+    note!(
         "{:14} {:>8} {:>8} {:>8} {:>9} {:>6} {:>6} {:>6}",
-        "", "Abs Rel", "Sq Rel", "RMSE", "RMSE log", "a1", "a2", "a3"
+        "",
+        "Abs Rel",
+        "Sq Rel",
+        "RMSE",
+        "RMSE log",
+        "a1",
+        "a2",
+        "a3"
     );
     let row = |name: &str, m: &Metrics| {
-        eprintln!(
+        note!(
             "{name:14} {:8.4} {:8.4} {:8.3} {:9.4} {:6.3} {:6.3} {:6.3}",
-            m.abs_rel, m.sq_rel, m.rmse, m.rmse_log, m.a1, m.a2, m.a3
+            m.abs_rel,
+            m.sq_rel,
+            m.rmse,
+            m.rmse_log,
+            m.a1,
+            m.a2,
+            m.a3
         );
     };
     row("untrained", &m.before);
@@ -243,7 +253,7 @@ fn configuration(args: &Args) -> Result<RunConfig> {
         c.optim.pose_rate *= factor;
     }
     if let Some(steps) = args.steps {
-        c.set_steps(steps);
+        c.steps = steps;
     }
     Ok(c)
 }

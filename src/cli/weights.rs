@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use parallax::Result;
-use parallax::train::recipe::check_size;
+use parallax::monovit::setup::check_size;
 use parallax::weights;
 use parallax::weights::{Need, Weights};
 
@@ -36,10 +36,10 @@ impl WeightsArgs {
         self.check()?;
         let mut weights = weights::load(&self.weights, Need::Depth, self.allow_partial)?;
         if weights.report.problem().is_some() {
-            eprintln!("{}", weights.report);
+            note!("{}", weights.report);
         }
-        weights.config.height = self.height.unwrap_or(weights.config.height);
-        weights.config.width = self.width.unwrap_or(weights.config.width);
+        weights.setup.height = self.height.unwrap_or(weights.setup.height);
+        weights.setup.width = self.width.unwrap_or(weights.setup.width);
         Ok(weights)
     }
 

@@ -166,7 +166,7 @@ impl Loader {
     pub fn start(data: Arc<dyn Dataset>, augment: Augment, batch: usize, seed: u64, first_step: u64) -> Result<Self> {
         if batch == 0 || data.len() < batch {
             let message = format!("{batch} samples a batch, but the data holds {}: make it smaller", data.len());
-            return Err(Error::setting("--batch", message));
+            return Err(Error::setting("batch", message));
         }
         let (send, batches) = sync_channel(3);
         let thread = std::thread::spawn(move || {

@@ -5,8 +5,7 @@ use crate::data::Dataset;
 use crate::data::augment::flip;
 use crate::data::batch::to_tensor;
 use crate::error::{Error, Result};
-use crate::monovit::MonoVit;
-use crate::monovit::loss::LossConfig;
+use crate::monovit::{MonoVit, Setup};
 use crate::nn::{Folded, Params};
 use image::RgbImage;
 
@@ -30,9 +29,9 @@ pub struct Predictor<'a> {
 }
 
 impl<'a> Predictor<'a> {
-    /// The networks with these weights; `config` gives the range of depths.
-    pub fn new(model: &'a MonoVit, params: &Params<f32>, config: &LossConfig) -> Self {
-        let (nearest, farthest) = (config.min_depth as f32, config.max_depth as f32);
+    /// The networks with these weights; `setup` gives the range of depths.
+    pub fn new(model: &'a MonoVit, params: &Params<f32>, setup: &Setup) -> Self {
+        let (nearest, farthest) = (setup.min_depth as f32, setup.max_depth as f32);
         Predictor { model, params: Folded::new(params), nearest, farthest }
     }
 

@@ -3,10 +3,10 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::setup::check_depths;
 use crate::error::{Error, Result};
 use crate::random::Random;
 use crate::tensor::{Float, Tensor, Var, profile};
-use crate::train::rotations::Shake;
 
 /// What is made of the photometric errors of a pixel's sources.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -51,16 +51,11 @@ pub struct LossConfig {
     pub smoothness: f64,
     /// Whether pixels that an unwarped neighbour explains better are left out.
     pub auto_mask: bool,
-    /// The number of steps before auto-masking sets in. While the motion is not known yet, a warped neighbour explains
-    /// hardly any pixel better than an unwarped one, and masking would leave little to learn from.
-    pub auto_mask_after: u64,
     /// The deviation of the noise that decides between equal errors.
     pub tie_break: f64,
     /// Whether the sampling grid is made for the convention it is sampled with (pixel centres), instead of the
     /// published combination (made for aligned corners, sampled without).
     pub consistent_grid: bool,
-    /// Known rotations for the pose network, at the beginning; not where training starts from given weights.
-    pub shake: Shake,
 }
 
 impl Default for LossConfig {
@@ -73,10 +68,8 @@ impl Default for LossConfig {
             scales: Scales::Full,
             smoothness: 1e-3,
             auto_mask: true,
-            auto_mask_after: 0,
             tie_break: 1e-5,
             consistent_grid: false,
-            shake: Shake::default(),
         }
     }
 }
@@ -88,10 +81,7 @@ impl LossConfig {
     /// Names the field that cannot be used: depths that are no range, a share outside [0, 1], a negative weight.
     pub fn check(&self) -> Result<()> {
         let refuse = |field: &str, message: String| Err(Error::setting(format!("loss.{field}"), message));
-        if !(self.min_depth > 0.0 && self.min_depth < self.max_depth && self.max_depth.is_finite()) {
-            let message = format!("{} to {} is no range of depths above 0", self.min_depth, self.max_depth);
-            return refuse("min_depth", message);
-        }
+        check_depths("loss.min_depth", self.min_depth, self.max_depth)?;
         if !(0.0..=1.0).contains(&self.ssim) {
             return refuse("ssim", format!("{} is not a share from 0 to 1", self.ssim));
         }

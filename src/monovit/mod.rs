@@ -6,6 +6,8 @@ pub mod encoder;
 pub mod loss;
 mod model;
 pub mod pose;
+pub mod setup;
 
 pub use config::{Ablation, Config, Preset};
 pub use model::MonoVit;
+pub use setup::Setup;

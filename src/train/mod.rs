@@ -7,5 +7,5 @@ pub mod start;
 mod state;
 pub mod trainer;
 
-pub use recipe::RunConfig;
-pub use trainer::{OptimConfig, StepReport, Trainer};
+pub use recipe::{OptimConfig, Plan, RunConfig};
+pub use trainer::{StepReport, Trainer};

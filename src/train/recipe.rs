@@ -1,18 +1,185 @@
 //! The recipe of a run: everything that decides it, as `config.toml` holds it.
+//!
+//! What belongs to the beginning of a training (warm-up, rotations, the delay of auto-masking) is a share of its steps, so
+//! that a recipe can be given another number of steps. [`RunConfig::plan`] turns the shares into steps.
 
-use std::collections::HashMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::rotations::Shake;
-use super::trainer::OptimConfig;
+use super::rotations::{RotationPlan, Rotations};
 use crate::data::batch::Augment;
 use crate::error::{Error, Result};
 use crate::monovit::loss::LossConfig;
-use crate::monovit::{Ablation, Config, Preset};
+use crate::monovit::setup::check_size;
+use crate::monovit::{Ablation, Config, Preset, Setup};
 use crate::optim::{Decay, Schedule};
+
+/// Steps of the default run.
+pub const STEPS: u64 = 3800;
+
+/// The whole number of steps that is nearest to a share of them.
+pub(super) fn steps_of(share: f64, steps: u64) -> u64 {
+    (share * steps as f64).round() as u64
+}
+
+/// The settings of the optimiser.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OptimConfig {
+    /// The learning rate of the depth encoder.
+    pub encoder_rate: f64,
+    /// The learning rate of the depth decoder.
+    pub rate: f64,
+    /// The learning rate of the pose networks. Their output is scaled by 0.01, so at the depth's rate they follow a
+    /// hundred times as slowly.
+    pub pose_rate: f64,
+    /// Decoupled weight decay, of every parameter.
+    pub decay: f64,
+    /// The decay rates b1 and b2 of AdamW's moments.
+    pub betas: [f64; 2],
+    /// The bound on the norm of all gradients; 0 for none.
+    pub clip: f64,
+    /// The decay of the average of the weights; 0 for none.
+    pub average: f64,
+    /// The factor on all rates over the run.
+    pub schedule: RateSchedule,
+}
+
+/// A factor on the learning rates, in shares of the training's steps.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RateSchedule {
+    /// The share of the steps over which the rates grow linearly from nothing.
+    pub warm_up: f64,
+    /// The way they fall afterwards.
+    pub decay: RateDecay,
+}
+
+/// The way learning rates fall, in shares of the training's steps.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "kind", deny_unknown_fields)]
+pub enum RateDecay {
+    /// Not at all.
+    Constant,
+    /// By `factor`, once, after the share `at` of the steps.
+    Step {
+        /// The share of the steps.
+        at: f64,
+        /// The factor.
+        factor: f64,
+    },
+    /// By `factor` after every share `every` of the steps.
+    Exponential {
+        /// The share of the steps between two falls.
+        every: f64,
+        /// The factor.
+        factor: f64,
+    },
+    /// Along half a cosine wave, down to `end` times the rate at the last step.
+    Cosine {
+        /// The factor at the end.
+        end: f64,
+    },
+}
+
+impl RateSchedule {
+    /// The schedule of a training of so many steps.
+    pub fn over(&self, steps: u64) -> Schedule {
+        let decay = match self.decay {
+            RateDecay::Constant => Decay::Constant,
+            RateDecay::Step { at, factor } => Decay::Step { at: steps_of(at, steps), factor },
+            RateDecay::Exponential { every, factor } => {
+                Decay::Exponential { every: steps_of(every, steps).max(1), factor }
+            }
+            RateDecay::Cosine { end } => Decay::Cosine { steps, end },
+        };
+        Schedule { warm_up: steps_of(self.warm_up, steps), decay }
+    }
+}
+
+impl OptimConfig {
+    /// Checks every number.
+    ///
+    /// # Errors
+    /// Names the field that cannot be used.
+    pub fn check(&self) -> Result<()> {
+        for (field, rate) in [
+            ("encoder_rate", self.encoder_rate),
+            ("rate", self.rate),
+            ("pose_rate", self.pose_rate),
+            ("decay", self.decay),
+        ] {
+            check(format!("optim.{field}"), rate, rate >= 0.0 && rate.is_finite(), "a number from 0")?;
+        }
+        for beta in self.betas {
+            check("optim.betas", beta, (0.0..1.0).contains(&beta), "a number from 0 to below 1")?;
+        }
+        let clip = self.clip;
+        check("optim.clip", clip, clip >= 0.0 && clip.is_finite(), "a bound above 0, or 0 for none")?;
+        let average = self.average;
+        check("optim.average", average, (0.0..1.0).contains(&average), "a number from 0 (for none) to below 1")?;
+        let schedule = self.schedule;
+        check_share("optim.schedule.warm_up", schedule.warm_up)?;
+        let check_factor = |field: &str, factor: f64| {
+            let field = format!("optim.schedule.decay.{field}");
+            check(field, factor, factor >= 0.0 && factor.is_finite(), "a factor from 0")
+        };
+        match schedule.decay {
+            RateDecay::Constant => Ok(()),
+            RateDecay::Step { at, factor } => {
+                check_share("optim.schedule.decay.at", at)?;
+                check_factor("factor", factor)
+            }
+            RateDecay::Exponential { every, factor } => {
+                check_share("optim.schedule.decay.every", every)?;
+                check_factor("factor", factor)
+            }
+            RateDecay::Cosine { end } => check_factor("end", end),
+        }
+    }
+}
+
+impl Rotations {
+    /// Checks every number.
+    ///
+    /// # Errors
+    /// Names the field that cannot be used.
+    pub fn check(&self) -> Result<()> {
+        check_share("rotations.share", self.share)?;
+        check_share("rotations.keep", self.keep)?;
+        for (field, number) in [("pixels", self.pixels), ("rate", self.rate), ("weight", self.weight)] {
+            check(format!("rotations.{field}"), number, number >= 0.0 && number.is_finite(), "a number from 0")?;
+        }
+        Ok(())
+    }
+}
+
+fn check(field: impl Into<String>, found: f64, good: bool, expected: &str) -> Result<()> {
+    if good { Ok(()) } else { Err(Error::setting(field, format!("{found} is not {expected}"))) }
+}
+
+fn check_share(field: &str, share: f64) -> Result<()> {
+    check(field, share, (0.0..=1.0).contains(&share), "a share of the steps, from 0 to 1")
+}
+
+/// What a trainer needs of a recipe, its shares turned into steps.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Plan {
+    /// The optimiser.
+    pub optim: OptimConfig,
+    /// The factor on the learning rates, step by step.
+    pub schedule: Schedule,
+    /// The loss.
+    pub loss: LossConfig,
+    /// The number of steps before auto-masking sets in.
+    pub auto_mask_after: u64,
+    /// Known rotations for the pose network.
+    pub rotations: RotationPlan,
+    /// The seed that everything random follows from.
+    pub seed: u64,
+}
 
 /// Everything that decides a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -24,9 +191,9 @@ pub struct RunConfig {
     pub height: usize,
     /// Width of the pictures that the networks see, a multiple of 32.
     pub width: usize,
-    /// Samples a step.
+    /// Batch size: how many samples a step sees.
     pub batch: usize,
-    /// Steps.
+    /// Number of training steps.
     pub steps: u64,
     /// Everything random follows from it.
     pub seed: u64,
@@ -56,21 +223,32 @@ pub struct RunConfig {
     pub log_every: u64,
     /// The whole state is written, and the weights are validated, every so many steps.
     pub checkpoint_every: u64,
-    /// What is taken away from the named sizes.
+    /// The share of the steps before auto-masking sets in. While the motion is not known yet, a warped neighbour explains
+    /// hardly any pixel better than an unwarped one, and masking would leave little to learn from.
+    pub auto_mask_delay: f64,
+    /// The parts that are taken away from the named sizes.
     #[serde(default)]
     pub ablation: Ablation,
     /// Augmentation.
     pub augment: Augment,
     /// The loss.
     pub loss: LossConfig,
+    /// Known rotations for the pose network, before training and at its beginning; not where training starts from given
+    /// weights of the pose networks.
+    pub rotations: Rotations,
     /// The optimiser.
     pub optim: OptimConfig,
 }
 
 impl RunConfig {
+    /// The default run: the reduced network on the embedded street.
+    pub fn usual() -> Self {
+        Self::new(Preset::Nano, STEPS)
+    }
+
     /// The recipe for a small network from scratch, on the embedded street.
     pub fn new(preset: Preset, steps: u64) -> Self {
-        let mut config = RunConfig {
+        RunConfig {
             preset,
             height: 96,
             width: 320,
@@ -89,12 +267,10 @@ impl RunConfig {
             checkpoint_every: 200,
             ablation: Ablation::default(),
             augment: Augment { flip: true, jitter: false },
-            loss: LossConfig {
-                auto_mask_after: 300,
-                consistent_grid: true,
-                shake: Shake { steps: 500, keep: 600, ..Shake::default() },
-                ..LossConfig::default()
-            },
+            // Of the 3,800 steps of the default run these shares are 300, 500 before training and 600, and 100.
+            auto_mask_delay: 0.0789,
+            loss: LossConfig { consistent_grid: true, ..LossConfig::default() },
+            rotations: Rotations { share: 0.1316, keep: 0.1579, ..Rotations::default() },
             optim: OptimConfig {
                 encoder_rate: 1e-3,
                 rate: 1e-3,
@@ -103,55 +279,60 @@ impl RunConfig {
                 betas: [0.9, 0.999],
                 clip: 0.0,
                 average: 0.99,
-                schedule: Schedule { warm_up: 100, decay: Decay::Cosine { steps, end: 0.01 } },
+                schedule: RateSchedule { warm_up: 0.0263, decay: RateDecay::Cosine { end: 0.01 } },
             },
-        };
-        config.set_steps(steps);
-        config
+        }
     }
 
-    /// Sets the number of steps: a cosine ends with them, a fall comes after three quarters, and what belongs to the
-    /// beginning takes no more than its share.
-    pub fn set_steps(&mut self, count: u64) {
-        self.steps = count;
-        match &mut self.optim.schedule.decay {
-            Decay::Cosine { steps, .. } => *steps = count,
-            Decay::Step { at, .. } => *at = count / 4 * 3,
-            Decay::Constant | Decay::Exponential { .. } => {}
-        }
-        let shrink = |steps: &mut u64, part: u64| *steps = (*steps).min(count / part);
-        shrink(&mut self.optim.schedule.warm_up, 10);
-        shrink(&mut self.loss.shake.steps, 4);
-        shrink(&mut self.loss.shake.keep, 4);
-        shrink(&mut self.loss.auto_mask_after, 7);
+    /// The networks, their pictures and the range of their depths.
+    pub fn setup(&self) -> Setup {
+        let RunConfig { preset, ablation, height, width, .. } = *self;
+        let (min_depth, max_depth) = (self.loss.min_depth, self.loss.max_depth);
+        Setup { preset, ablation, height, width, min_depth, max_depth }
     }
 
     /// The sizes of the networks.
     pub fn model(&self) -> Config {
-        self.ablation.apply(self.preset.config())
+        self.setup().model()
+    }
+
+    /// The recipe for its number of steps.
+    pub fn plan(&self) -> Plan {
+        Plan {
+            optim: self.optim,
+            schedule: self.optim.schedule.over(self.steps),
+            loss: self.loss,
+            auto_mask_after: steps_of(self.auto_mask_delay, self.steps),
+            rotations: self.rotations.over(self.steps),
+            seed: self.seed,
+        }
     }
 
     /// Checks what can be checked without data.
+    ///
+    /// # Errors
+    /// Names the field that cannot be used.
     pub fn check(&self) -> Result<()> {
-        check_size("--height", self.height)?;
-        check_size("--width", self.width)?;
-        if self.batch == 0 {
-            return Err(Error::setting("--batch", "at least 1"));
+        check_size("height", self.height)?;
+        check_size("width", self.width)?;
+        for (field, number) in [
+            ("batch", self.batch as u64),
+            ("steps", self.steps),
+            ("log_every", self.log_every),
+            ("checkpoint_every", self.checkpoint_every),
+        ] {
+            if number == 0 {
+                return Err(Error::setting(field, "0 is too few: at least 1"));
+            }
         }
         if self.initial_disparity.is_some_and(|d| d.is_nan() || d <= 0.0 || d >= 1.0) {
-            return Err(Error::setting("initial_disparity", "a number between 0 and 1"));
+            return Err(Error::setting("initial_disparity", "expected a number between 0 and 1"));
         }
-        if self.steps == 0 {
-            return Err(Error::setting("--steps", "at least 1"));
-        }
+        check_share("auto_mask_delay", self.auto_mask_delay)?;
         self.loss.check()?;
+        self.rotations.check()?;
+        self.optim.check()?;
         self.ablation.check(&self.preset.config())
-    }
-
-    /// What a safetensors file says about itself: this configuration, as JSON under `parallax`.
-    pub fn metadata(&self) -> Result<HashMap<String, String>> {
-        let text = serde_json::to_string(self).map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
-        Ok(HashMap::from([("parallax".into(), text)]))
     }
 }
 
@@ -170,19 +351,141 @@ fn none_one_or_many<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result
     })
 }
 
-/// Sides of pictures are multiples of 32, because the deepest map has a 32nd of them, and at least 64, because a map of
-/// one pixel has nothing to be mirrored at its border.
-pub fn check_size(name: &str, size: usize) -> Result<()> {
-    if !size.is_multiple_of(32) || !(64..=8192).contains(&size) {
-        let below = (size / 32 * 32).clamp(64, 8192);
-        let message = format!("{size} is not a multiple of 32 from 64 to 8192; {below} would do");
-        return Err(Error::setting(name, message));
-    }
-    Ok(())
-}
-
-/// Reads a run's (or anybody's) configuration.
+/// Reads a configuration: a run's `config.toml`, or part of one; what it does not say is as in [`RunConfig::new`] of its
+/// preset.
+///
+/// # Errors
+/// Names the file, and the line where a value cannot be used.
 pub fn read_config(path: &Path) -> Result<RunConfig> {
     let text = fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
-    toml::from_str(&text).map_err(|e| Error::file(path, e.to_string()))
+    let wrong = |e: toml::de::Error| Error::file(path, e.to_string());
+    let said: toml::Table = toml::from_str(&text).map_err(wrong)?;
+    let preset = said.get("preset").cloned().map_or(Ok(Preset::Nano), toml::Value::try_into).map_err(wrong)?;
+    let usual = toml::Table::try_from(RunConfig::new(preset, STEPS));
+    let mut whole = usual.map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
+    fill(&mut whole, said);
+    let config: RunConfig = whole.try_into().map_err(wrong)?;
+    config.check().map_err(|error| match error {
+        Error::Setting { name, message } => {
+            let place = line_of(&text, &name).map_or(String::new(), |line| format!("line {line}: "));
+            Error::file(path, format!("{place}{name}: {message}"))
+        }
+        other => other,
+    })?;
+    Ok(config)
+}
+
+/// Puts what was said over the defaults, table by table. A choice (`kind`) with what belongs to it is one thing.
+fn fill(defaults: &mut toml::Table, said: toml::Table) {
+    for (key, value) in said {
+        match (defaults.get_mut(&key), value) {
+            (Some(toml::Value::Table(below)), toml::Value::Table(said)) if !said.contains_key("kind") => {
+                fill(below, said);
+            }
+            (_, value) => {
+                defaults.insert(key, value);
+            }
+        }
+    }
+}
+
+/// The line of a TOML text, from 1, that sets a field such as `optim.clip`.
+fn line_of(text: &str, field: &str) -> Option<usize> {
+    let (table, key) = field.rsplit_once('.').unwrap_or(("", field));
+    let mut within = "";
+    for (i, line) in text.lines().enumerate() {
+        let line = line.trim();
+        if let Some(name) = line.strip_prefix('[').and_then(|rest| rest.strip_suffix(']')) {
+            within = name.trim();
+        } else if within == table && line.split('=').next().is_some_and(|name| name.trim() == key) {
+            return Some(i + 1);
+        }
+    }
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn written(text: &str) -> Result<RunConfig> {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("config.toml");
+        fs::write(&path, text).unwrap();
+        read_config(&path)
+    }
+
+    #[test]
+    fn shares_become_the_steps_of_the_default_run_and_grow_with_it() {
+        let plan = RunConfig::usual().plan();
+        assert_eq!((plan.schedule.warm_up, plan.auto_mask_after), (100, 300));
+        assert_eq!((plan.rotations.steps, plan.rotations.keep), (500, 600));
+        assert_eq!(plan.schedule.decay, Decay::Cosine { steps: 3800, end: 0.01 });
+        let twice = RunConfig { steps: 7600, ..RunConfig::usual() }.plan();
+        assert_eq!((twice.schedule.warm_up, twice.auto_mask_after), (200, 600));
+        assert_eq!((twice.rotations.steps, twice.rotations.keep), (1000, 1200));
+    }
+
+    #[test]
+    fn the_recipe_for_the_reference_street_has_the_steps_it_was_measured_with() {
+        let config =
+            read_config(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/benches/reference_street.toml"))).unwrap();
+        let plan = config.plan();
+        assert_eq!((plan.schedule.warm_up, plan.auto_mask_after), (100, 300));
+        assert_eq!((plan.rotations.steps, plan.rotations.keep), (500, 600));
+        assert_eq!(plan.schedule.decay, Decay::Cosine { steps: 3500, end: 0.01 });
+    }
+
+    #[test]
+    fn a_recipe_of_a_short_run_is_one_of_a_long_run_with_more_steps() {
+        let short = RunConfig::new(Preset::Nano, 20);
+        assert_eq!(RunConfig { steps: STEPS, ..short }.plan(), RunConfig::usual().plan());
+    }
+
+    #[test]
+    fn part_of_a_configuration_is_filled_from_its_preset() {
+        let config = written("preset = \"small\"\nsteps = 7\n[loss]\nssim = 0.5\n[optim]\nclip = 2.0").unwrap();
+        let mut expected = RunConfig::new(Preset::Small, 7);
+        (expected.loss.ssim, expected.optim.clip) = (0.5, 2.0);
+        assert_eq!(config, expected);
+        let step = written("[optim.schedule.decay]\nkind = \"step\"\nat = 0.75\nfactor = 0.1").unwrap();
+        assert_eq!(step.optim.schedule.decay, RateDecay::Step { at: 0.75, factor: 0.1 });
+        assert_eq!(written("").unwrap(), RunConfig::usual());
+    }
+
+    #[test]
+    fn what_is_written_is_read_back() {
+        let config = RunConfig { split: Some("a list.txt".into()), ..RunConfig::usual() };
+        assert_eq!(written(&toml::to_string(&config).unwrap()).unwrap(), config);
+    }
+
+    #[test]
+    fn every_field_that_cannot_be_used_is_refused_with_its_line() {
+        for (line, text) in [
+            ("line 1: steps", "steps = 0"),
+            ("line 1: log_every", "log_every = 0"),
+            ("line 2: checkpoint_every", "seed = 1\ncheckpoint_every = 0"),
+            ("line 1: auto_mask_delay", "auto_mask_delay = 1.5"),
+            ("line 2: optim.clip", "[optim]\nclip = inf"),
+            ("line 2: optim.average", "[optim]\naverage = 2.0"),
+            ("line 2: optim.rate", "[optim]\nrate = -1e-3"),
+            ("line 2: optim.pose_rate", "[optim]\npose_rate = nan"),
+            ("line 2: optim.decay", "[optim]\ndecay = inf"),
+            ("line 2: optim.betas", "[optim]\nbetas = [2.0, -3.0]"),
+            ("line 2: optim.schedule.warm_up", "[optim.schedule]\nwarm_up = 100"),
+            ("line 4: optim.schedule.decay.end", "# a comment\n[optim.schedule.decay]\nkind = \"cosine\"\nend = -inf"),
+            ("line 2: rotations.share", "[rotations]\nshare = 500.0"),
+            ("line 2: rotations.pixels", "[rotations]\npixels = nan"),
+            ("line 3: rotations.rate", "[rotations]\npixels = 3.0\nrate = -1.0"),
+            ("line 2: loss.ssim", "[loss]\nssim = 2.0"),
+            ("line 2: loss.min_depth", "[loss]\nmin_depth = 0.0"),
+        ] {
+            let error = written(text).unwrap_err().to_string();
+            assert!(error.contains("config.toml") && error.contains(line), "{text}: {error}");
+        }
+        for (name, text) in [("stepps", "stepps = 3"), ("shake", "[loss.shake]\nsteps = 2")] {
+            let error = written(text).unwrap_err().to_string();
+            assert!(error.contains(name), "{error}");
+        }
+    }
 }

@@ -1,4 +1,4 @@
-//! Camera shake: frames turned by known angles, which teach the pose network what a rotation looks like.
+//! Rotation pretraining: frames turned by known angles, which teach the pose network what a rotation looks like.
 //!
 //! From random weights the pose network is slow to see that pictures turn: for thousands of steps it answers with the
 //! mean motion of all its training pairs, and whatever the camera's yaw and pitch really did is noise in the warp,
@@ -9,6 +9,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::recipe::steps_of;
 use crate::data::batch::Batch;
 use crate::monovit::MonoVit;
 use crate::nn::{Context, Params};
@@ -16,35 +17,58 @@ use crate::optim::{AdamW, Decay, Group, Schedule};
 use crate::random::Random;
 use crate::tensor::{Tape, Tensor, Var};
 
-/// How much, and for how long.
+/// How much pairs are turned, and for how long, in shares of the training's steps.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub struct Shake {
-    /// Steps before training, of the pose network alone; 0 for none.
-    pub steps: u64,
+pub struct Rotations {
+    /// Steps of the pose network alone before training, as a share of the training's steps; 0 for none.
+    pub share: f64,
     /// The standard deviation of yaw and pitch at first, as the pixels that the picture's centre moves by. It shrinks to
     /// a quarter.
     pub pixels: f64,
     /// Their learning rate.
     pub rate: f64,
-    /// The number of steps of the training itself that still have pairs with known rotations, of the last size: so long
-    /// as depth knows nothing, it gives the pose network reasons to forget.
+    /// The share of the training's own steps, its first ones, that still have pairs with known rotations, of the last
+    /// size: so long as depth knows nothing, it gives the pose network reasons to forget.
+    pub keep: f64,
+    /// The weight of the mean error (in pixels) in the loss of those steps.
+    pub weight: f64,
+}
+
+impl Default for Rotations {
+    /// None.
+    fn default() -> Self {
+        Rotations { share: 0.0, pixels: 10.0, rate: 1e-3, keep: 0.0, weight: 0.05 }
+    }
+}
+
+impl Rotations {
+    /// Those of a training of so many steps.
+    pub fn over(&self, steps: u64) -> RotationPlan {
+        let Rotations { pixels, rate, weight, .. } = *self;
+        RotationPlan { steps: steps_of(self.share, steps), pixels, rate, keep: steps_of(self.keep, steps), weight }
+    }
+}
+
+/// [`Rotations`] with their shares turned into steps.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RotationPlan {
+    /// Steps before training, of the pose network alone; 0 for none.
+    pub steps: u64,
+    /// The standard deviation of yaw and pitch at first, in pixels of the picture's centre.
+    pub pixels: f64,
+    /// Their learning rate.
+    pub rate: f64,
+    /// Steps of the training itself that still have pairs with known rotations.
     pub keep: u64,
     /// The weight of the mean error (in pixels) in the loss of those steps.
     pub weight: f64,
 }
 
-impl Default for Shake {
-    /// None.
-    fn default() -> Self {
-        Shake { steps: 0, pixels: 10.0, rate: 1e-3, keep: 0, weight: 0.05 }
-    }
-}
-
 /// Steps over which the learning rate grows.
 const WARM_UP: u64 = 30;
 
-impl Shake {
+impl RotationPlan {
     /// The standard deviation of the angles at a step (from 0), in pixels.
     fn size(&self, step: u64) -> f64 {
         self.pixels * (1.0 - 0.75 * step as f64 / self.steps as f64)
@@ -60,14 +84,14 @@ impl Shake {
         seed: u64,
     ) -> Option<Var<f32>> {
         let mut random = Random::new(seed, KEEP_STREAM.wrapping_add(step));
-        let error = || shake_error(model, c, batch, self.size(self.steps), &mut random);
+        let error = || rotation_error(model, c, batch, self.size(self.steps), &mut random);
         (step < self.keep && self.steps > 0).then(error).map(|e| e.affine(self.weight, 0.0))
     }
 }
 
 /// The steps before training. They have an optimiser of their own, so that training starts with a fresh one.
 pub struct Lesson {
-    shake: Shake,
+    plan: RotationPlan,
     adamw: AdamW<f32>,
     seed: u64,
 }
@@ -77,8 +101,8 @@ const KEEP_STREAM: u64 = 6 << 40;
 
 impl Lesson {
     /// No steps taken.
-    pub fn new(shake: Shake, params: &Params<f32>, seed: u64) -> Self {
-        Lesson { shake, adamw: AdamW::new(params), seed }
+    pub fn new(plan: RotationPlan, params: &Params<f32>, seed: u64) -> Self {
+        Lesson { plan, adamw: AdamW::new(params), seed }
     }
 
     /// One step; the mean error in pixels before it.
@@ -87,10 +111,10 @@ impl Lesson {
         let tape = Tape::new();
         let mut random = Random::new(self.seed, STREAM.wrapping_add(step));
         let c = Context::training(params, &tape, Random::new(self.seed, STREAM - 1));
-        let error = shake_error(model, &c, batch, self.shake.size(step), &mut random);
+        let error = rotation_error(model, &c, batch, self.plan.size(step), &mut random);
         let gradients = c.gradients(&mut error.backward());
         let schedule = Schedule { warm_up: WARM_UP, decay: Decay::Constant };
-        let learning_rate = self.shake.rate * schedule.factor(step + 1);
+        let learning_rate = self.plan.rate * schedule.factor(step + 1);
         self.adamw.step(params, &gradients, |_| Group { learning_rate, decay: 0.0 });
         for (id, value) in c.into_moved() {
             params.set(id, value);
@@ -99,11 +123,11 @@ impl Lesson {
     }
 }
 
-/// The share of roll in the shake: cars hardly roll.
+/// The share of roll in the turns: cars hardly roll.
 const ROLL: f64 = 0.25;
 
-/// The mean error, in pixels, of the rotations that the pose network sees in shaken neighbours.
-pub fn shake_error(model: &MonoVit, c: &Context<f32>, batch: &Batch, pixels: f64, random: &mut Random) -> Var<f32> {
+/// The mean error, in pixels, of the rotations that the pose network sees in turned neighbours.
+pub fn rotation_error(model: &MonoVit, c: &Context<f32>, batch: &Batch, pixels: f64, random: &mut Random) -> Var<f32> {
     let [prev, target, next] = &batch.seen;
     let mut turned = |frames: &Tensor<f32>| turn(frames, &angles(&batch.intrinsics, pixels, random), &batch.intrinsics);
     // Both frames of a pair are turned, so that which of them is interpolated says nothing.
@@ -187,10 +211,10 @@ mod tests {
             params.value_mut(id).data_mut().fill(0.0);
         }
         let before = params.clone();
-        let shake = Shake { steps: 2, pixels: 6.0, ..Shake::default() };
-        let mut lesson = Lesson::new(shake, &params, 0);
+        let plan = RotationPlan { steps: 2, pixels: 6.0, ..Rotations::default().over(0) };
+        let mut lesson = Lesson::new(plan, &params, 0);
         let error = lesson.step(&model, &mut params, &batch);
-        assert!(error > 0.2 * shake.pixels && error < 3.0 * shake.pixels, "{error} pixels");
+        assert!(error > 0.2 * plan.pixels && error < 3.0 * plan.pixels, "{error} pixels");
         lesson.step(&model, &mut params, &batch);
         for ((_, old), (_, new)) in before.iter().zip(params.iter()) {
             let (name, same) = (old.name(), old.value.same_bits(&new.value));

@@ -22,7 +22,7 @@ use crate::eval::metrics::{MeanMap, Metrics, Protocol, Scale};
 use crate::eval::predictor::{Evaluation, Predictor, evaluate, evaluate_mean_map};
 use crate::formats::atomic::{check_writable, write_bytes_atomically};
 use crate::formats::safetensors;
-use crate::monovit::MonoVit;
+use crate::monovit::{MonoVit, Setup};
 use crate::nn::Params;
 use crate::report::colormap::disparity_to_image;
 use crate::weights;
@@ -151,11 +151,12 @@ impl Run {
         Self::claim(folder)?;
         if start.knows_motion {
             // Pose networks that somebody trained know rotations already.
-            config.loss.shake.steps = 0;
+            config.rotations.share = 0.0;
+            config.rotations.keep = 0.0;
         }
         let text = toml::to_string(&config).map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
         write_bytes_atomically(folder.join("config.toml"), text.as_bytes())?;
-        let trainer = Trainer::of(start.model, start.params, config.optim, config.loss, config.seed);
+        let trainer = Trainer::of(start.model, start.params, config.plan());
         let run = Self::of(folder, config, trainer);
         run.save()?;
         Ok(run)
@@ -166,7 +167,7 @@ impl Run {
         let path = folder.join("config.toml");
         let config = read_config(&path)?;
         config.check().map_err(|e| Error::file(&path, e.to_string()))?;
-        let trainer = Trainer::new(config.model(), config.optim, config.loss, config.seed);
+        let trainer = Trainer::new(config.model(), config.plan());
         let mut run = Self::of(folder, config, trainer);
         let state = run.state_file();
         run.trainer.load(&state)?;
@@ -206,7 +207,7 @@ impl Run {
             data.test.as_deref().map(|t| (t, (0..t.len()).collect::<Vec<_>>()));
         if let (Some((test, samples)), None) = (&test, self.before) {
             tell(Event::Phase("measuring the untrained network"));
-            let predictor = Predictor::new(&self.trainer.model, &self.trainer.params, &self.config.loss);
+            let predictor = Predictor::new(&self.trainer.model, &self.trainer.params, &self.config.setup());
             self.before = Some(evaluate(&predictor, *test, samples, DENSE, |_| ())?.metrics);
         }
         // Before training, so that ground truth that cannot be read costs no run.
@@ -221,7 +222,7 @@ impl Run {
         let log = fs::OpenOptions::new().create(true).append(true).open(&log_path);
         let mut log = log.map_err(|e| Error::io(&log_path, e))?;
 
-        if self.trainer.steps() == 0 && self.config.loss.shake.steps > 0 {
+        if self.trainer.steps() == 0 && self.config.plan().rotations.steps > 0 {
             tell(Event::Phase("teaching the pose network what a rotation looks like"));
             let started = Instant::now();
             // The same frames as in training, in another order.
@@ -295,10 +296,10 @@ impl Run {
         let best = self.best.is_none_or(|b| photometric < b);
         if best {
             self.best = Some(photometric);
-            write_weights(&self.folder.join("best.safetensors"), &weights, &self.config)?;
+            write_weights(&self.folder.join("best.safetensors"), &weights, &self.config.setup())?;
         }
         let samples = forty_of(data.validation.len());
-        let predictor = Predictor::new(&self.trainer.model, &weights, &self.config.loss);
+        let predictor = Predictor::new(&self.trainer.model, &weights, &self.config.setup());
         let abs_rel = match data.validation.depth(0)? {
             Some(_) => Some(evaluate(&predictor, data.validation.as_ref(), &samples, DENSE, |_| ())?.metrics.abs_rel),
             None => None,
@@ -322,7 +323,7 @@ impl Run {
     ) -> Result<Option<RunMetrics>> {
         tell(Event::Phase("measuring the best weights"));
         let (model, params, _) = load_weights(&self.folder.join("best.safetensors"))?;
-        let predictor = Predictor::new(&model, &params, &self.config.loss);
+        let predictor = Predictor::new(&model, &params, &self.config.setup());
         let shown: &dyn Dataset = test.as_ref().map_or(data.validation.as_ref(), |(t, _)| *t);
         self.write_images(&predictor, shown)?;
         let Some((test, samples)) = test else { return Ok(None) };
@@ -388,13 +389,13 @@ fn forty_of(len: usize) -> Vec<usize> {
     (0..len).step_by(len.div_ceil(40).max(1)).collect()
 }
 
-/// Writes weights for use: PyTorch's names and layouts, the configuration in the metadata.
-pub fn write_weights(path: &Path, params: &Params<f32>, config: &RunConfig) -> Result<()> {
-    safetensors::write(path, &safetensors::export(params), config.metadata()?)
+/// Writes weights for use: PyTorch's names and layouts, their setup in the metadata.
+pub fn write_weights(path: &Path, params: &Params<f32>, setup: &Setup) -> Result<()> {
+    safetensors::write(path, &safetensors::export(params), setup.metadata()?)
 }
 
 /// Reads weights to predict depth with: a run's folder, or a file or folder of any kind that [`weights::load`] reads.
-pub fn load_weights(path: &Path) -> Result<(MonoVit, Params<f32>, RunConfig)> {
-    let Weights { model, params, config, .. } = weights::load(&[path.to_owned()], Need::Depth, false)?;
-    Ok((model, params, config))
+pub fn load_weights(path: &Path) -> Result<(MonoVit, Params<f32>, Setup)> {
+    let Weights { model, params, setup, .. } = weights::load(&[path.to_owned()], Need::Depth, false)?;
+    Ok((model, params, setup))
 }

@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::recipe::Plan;
 use super::rotations::Lesson;
 use crate::data::batch::Batch;
 use crate::error::{Error, Result};
@@ -9,35 +10,12 @@ use crate::monovit::MonoVit;
 use crate::monovit::config::Config;
 use crate::monovit::loss::{Loss, LossConfig, Scales, TieBreak, Views, loss};
 use crate::nn::{Context, Params};
-use crate::optim::{AdamW, Average, Group, Schedule, clip_norm};
+use crate::optim::{AdamW, Average, Group, clip_norm};
 use crate::random::Random;
 use crate::tensor::profile;
 use crate::tensor::{Tape, Var};
 
-/// How weights are moved.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct OptimConfig {
-    /// The learning rate of the depth encoder.
-    pub encoder_rate: f64,
-    /// The learning rate of the depth decoder.
-    pub rate: f64,
-    /// The learning rate of the pose networks. Their output is scaled by 0.01, so at the depth's rate they follow a
-    /// hundred times as slowly.
-    pub pose_rate: f64,
-    /// Decoupled weight decay, of every parameter.
-    pub decay: f64,
-    /// b1 and b2 of AdamW.
-    pub betas: [f64; 2],
-    /// The bound on the norm of all gradients; 0 for none.
-    pub clip: f64,
-    /// The decay of the average of the weights; 0 for none.
-    pub average: f64,
-    /// The factor on both rates, step by step.
-    pub schedule: Schedule,
-}
-
-/// What a step reports.
+/// The figures of a step.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct StepReport {
     /// The step, from 1.
@@ -66,12 +44,10 @@ pub struct Trainer {
     pub model: MonoVit,
     /// Their parameters.
     pub params: Params<f32>,
-    optim: OptimConfig,
-    loss: LossConfig,
+    plan: Plan,
     pub(super) adamw: AdamW<f32>,
     pub(super) average: Option<Average<f32>>,
     ties: TieBreak<f32>,
-    seed: u64,
 }
 
 /// What the loss compares in a batch.
@@ -90,18 +66,18 @@ const DROP_STREAM: u64 = 4 << 40;
 
 impl Trainer {
     /// A model at its start.
-    pub fn new(config: Config, optim: OptimConfig, loss: LossConfig, seed: u64) -> Self {
-        let (model, params) = MonoVit::new(config, seed);
-        Self::of(model, params, optim, loss, seed)
+    pub fn new(config: Config, plan: Plan) -> Self {
+        let (model, params) = MonoVit::new(config, plan.seed);
+        Self::of(model, params, plan)
     }
 
     /// A model with the given weights.
-    pub fn of(model: MonoVit, params: Params<f32>, optim: OptimConfig, loss: LossConfig, seed: u64) -> Self {
+    pub fn of(model: MonoVit, params: Params<f32>, plan: Plan) -> Self {
         let mut adamw = AdamW::new(&params);
-        adamw.betas = optim.betas;
-        let average = (optim.average > 0.0).then(|| Average::new(&params, optim.average));
-        let ties = TieBreak::new(loss.tie_break, &mut Random::new(seed, TIE_STREAM - 1));
-        Trainer { model, params, optim, loss, adamw, average, ties, seed }
+        adamw.betas = plan.optim.betas;
+        let average = (plan.optim.average > 0.0).then(|| Average::new(&params, plan.optim.average));
+        let ties = TieBreak::new(plan.loss.tie_break, &mut Random::new(plan.seed, TIE_STREAM - 1));
+        Trainer { model, params, plan, adamw, average, ties }
     }
 
     /// Teaches the pose network known rotations, before the first step; `tell` hears of every step and its error in
@@ -111,15 +87,15 @@ impl Trainer {
         mut next_batch: impl FnMut() -> Result<Batch>,
         mut tell: impl FnMut(u64, f64) -> bool,
     ) -> Result<bool> {
-        let shake = self.loss.shake;
-        let mut lesson = Lesson::new(shake, &self.params, self.seed);
-        for step in 1..=shake.steps {
+        let rotations = self.plan.rotations;
+        let mut lesson = Lesson::new(rotations, &self.params, self.plan.seed);
+        for step in 1..=rotations.steps {
             let error = lesson.step(&self.model, &mut self.params, &next_batch()?);
             if !tell(step, error) {
                 return Ok(false);
             }
         }
-        self.average = (self.optim.average > 0.0).then(|| Average::new(&self.params, self.optim.average));
+        self.average = (self.plan.optim.average > 0.0).then(|| Average::new(&self.params, self.plan.optim.average));
         Ok(true)
     }
 
@@ -136,12 +112,13 @@ impl Trainer {
     /// The loss of a batch, and the context it was computed in.
     fn forward(&self, tape: &Tape<f32>, batch: &Batch) -> (Context<f32>, Loss<f32>) {
         let step = self.adamw.steps;
-        let c = Context::training(&self.params, tape, Random::new(self.seed, DROP_STREAM.wrapping_add(step)));
+        let c = Context::training(&self.params, tape, Random::new(self.plan.seed, DROP_STREAM.wrapping_add(step)));
         let [prev, target, next] = batch.seen.each_ref().map(|t| Var::constant(t.clone()));
         let disparities = self.model.disparities(&c, &target);
         let transforms = self.model.transforms(&c, &prev, &target, &next);
-        let mut random = Random::new(self.seed, TIE_STREAM.wrapping_add(step));
-        let config = LossConfig { auto_mask: self.loss.auto_mask && step >= self.loss.auto_mask_after, ..self.loss };
+        let mut random = Random::new(self.plan.seed, TIE_STREAM.wrapping_add(step));
+        let auto_mask = self.plan.loss.auto_mask && step >= self.plan.auto_mask_after;
+        let config = LossConfig { auto_mask, ..self.plan.loss };
         let found =
             loss(&disparities, &transforms, &views(batch, config.scales), &config, Some((&self.ties, &mut random)));
         (c, found)
@@ -159,7 +136,7 @@ impl Trainer {
         if !total.is_finite() {
             return Err(self.explain(step, batch));
         }
-        let objective = match self.loss.shake.term(step - 1, &self.model, &c, batch, self.seed) {
+        let objective = match self.plan.rotations.term(step - 1, &self.model, &c, batch, self.plan.seed) {
             Some(term) => &found.total + term,
             None => found.total.clone(),
         };
@@ -167,7 +144,7 @@ impl Trainer {
         let mut gradients = c.gradients(&mut all);
         // From here on nobody else holds the weights: they are changed in place.
         let moved = c.into_moved();
-        let bound = if self.optim.clip > 0.0 { self.optim.clip } else { f64::INFINITY };
+        let bound = if self.plan.optim.clip > 0.0 { self.plan.optim.clip } else { f64::INFINITY };
         let grad_norm = profile::phase("norm of the gradients", || clip_norm(&mut gradients, bound));
         if !grad_norm.is_finite() {
             let bad = self.params.iter().zip(&gradients).find(|(_, g)| g.as_ref().is_some_and(|g| !g.is_finite()));
@@ -176,9 +153,10 @@ impl Trainer {
                 "step {step}: the gradient of {name} is not finite (the loss is {total})"
             )));
         }
-        let factor = self.optim.schedule.factor(step);
-        let learning_rates = [self.optim.encoder_rate, self.optim.rate, self.optim.pose_rate].map(|r| r * factor);
-        let decay = self.optim.decay;
+        let factor = self.plan.schedule.factor(step);
+        let learning_rates =
+            [self.plan.optim.encoder_rate, self.plan.optim.rate, self.plan.optim.pose_rate].map(|r| r * factor);
+        let decay = self.plan.optim.decay;
         let group = |name: &str| {
             let which = if name.starts_with("encoder.") {
                 0
@@ -234,7 +212,7 @@ impl Trainer {
             let [prev, target, next] = batch.seen.each_ref().map(|t| Var::constant(t.clone()));
             let disparities = self.model.disparities(&c, &target);
             let transforms = self.model.transforms(&c, &prev, &target, &next);
-            loss(&disparities[..1], &transforms, &views(batch, Scales::Full), &self.loss, None).photometric
+            loss(&disparities[..1], &transforms, &views(batch, Scales::Full), &self.plan.loss, None).photometric
         });
         let errors: Vec<f64> = errors.collect();
         errors.iter().sum::<f64>() / errors.len().max(1) as f64

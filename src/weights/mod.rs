@@ -5,7 +5,7 @@
 //!
 //! // A folder with encoder.pth and depth.pth, one file with all, or a run of this program.
 //! let weights = load(&["mono_640x192".into()], Need::Depth, false)?;
-//! println!("{} at {} x {}", weights.config.preset.name(), weights.config.width, weights.config.height);
+//! println!("{} at {} x {}", weights.setup.preset.name(), weights.setup.width, weights.setup.height);
 //! println!("{}", weights.report);
 //! # Ok::<(), parallax::Error>(())
 //! ```
@@ -29,9 +29,8 @@ pub use sources::{Need, Sources};
 use std::path::PathBuf;
 
 use crate::error::Result;
-use crate::monovit::{Ablation, MonoVit, Preset};
+use crate::monovit::{Ablation, MonoVit, Preset, Setup};
 use crate::nn::{Params, Report};
-use crate::train::RunConfig;
 
 /// A model with weights from files.
 pub struct Weights {
@@ -39,8 +38,8 @@ pub struct Weights {
     pub model: MonoVit,
     /// Their parameters. Those that were not loaded are as a new model's.
     pub params: Params<f32>,
-    /// The size, the pictures' size, the range of depths.
-    pub config: RunConfig,
+    /// The size of the networks and of their pictures, the range of depths.
+    pub setup: Setup,
     /// What was loaded and what was not.
     pub report: Report,
 }
@@ -48,18 +47,18 @@ pub struct Weights {
 /// Loads weights from files and folders; see [`Sources::open`] for which.
 ///
 /// # Errors
-/// As [`Sources::open`], [`Sources::config`] and [`Sources::fill`]; if the tensors are of another size than the
+/// As [`Sources::open`], [`Sources::setup`] and [`Sources::fill`]; if the tensors are of another size than the
 /// configuration beside them, unless `allow_partial`.
 pub fn load(paths: &[PathBuf], need: Need, allow_partial: bool) -> Result<Weights> {
     let sources = Sources::open(paths)?;
-    let config = sources.config(need)?;
+    let setup = sources.setup(need)?;
     // Of a network that is not wholly a preset, tensor by tensor will do.
-    if !allow_partial && config.ablation == Ablation::default() {
-        sources.expect(config.preset)?;
+    if !allow_partial && setup.ablation == Ablation::default() {
+        sources.expect(setup.preset)?;
     }
-    let (model, mut params) = MonoVit::new(config.model(), 0);
+    let (model, mut params) = MonoVit::new(setup.model(), 0);
     let report = sources.fill(&mut params, need, allow_partial)?;
-    Ok(Weights { model, params, config, report })
+    Ok(Weights { model, params, setup, report })
 }
 
 /// The size of the network that some files are weights of.

@@ -83,7 +83,7 @@ pub fn save(weights: &Weights, path: &Path, form: Form) -> Result<()> {
     let entries = loaded(weights);
     // The encoder is what a configuration belongs to: the other networks alone could be of several sizes.
     let with_encoder = weights.report.matched.iter().any(|name| name.starts_with("encoder."));
-    let (height, width) = (weights.config.height as i64, weights.config.width as i64);
+    let (height, width) = (weights.setup.height as i64, weights.setup.width as i64);
     let size = if with_encoder { vec![("height", height), ("width", width)] } else { Vec::new() };
     let about = || {
         let size = size.iter().map(|&(name, pixels)| (name.to_owned(), Saved::Int(pixels)));
@@ -92,7 +92,7 @@ pub fn save(weights: &Weights, path: &Path, form: Form) -> Result<()> {
     match form {
         Form::Safetensors => {
             let tensors = entries.iter().map(|e| (e.names[0].clone(), e.tensor.clone())).collect();
-            let metadata = if with_encoder { weights.config.metadata()? } else { HashMap::new() };
+            let metadata = if with_encoder { weights.setup.metadata()? } else { HashMap::new() };
             safetensors::write(path, &tensors, metadata)
         }
         Form::Npz => {

@@ -8,10 +8,9 @@ use super::sizes::Sizes;
 use crate::error::{Error, Result};
 use crate::formats::TensorFile;
 use crate::formats::pth::shown;
-use crate::monovit::Preset;
-use crate::monovit::loss::LossConfig;
+use crate::monovit::setup::check_size;
+use crate::monovit::{Preset, Setup};
 use crate::nn::{Named, Params, Report, Skipped, fit};
-use crate::train::recipe::{RunConfig, check_size};
 
 /// Which of the four networks have to be there. One that is there at all has to be there whole.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -47,7 +46,7 @@ pub struct Sources {
     skipped: Vec<Skipped>,
     /// `height` and `width`, where a file says them.
     size: [Option<usize>; 2],
-    config: Option<RunConfig>,
+    setup: Option<Setup>,
 }
 
 impl Sources {
@@ -63,7 +62,7 @@ impl Sources {
             unexpected: Vec::new(),
             skipped: Vec::new(),
             size: [None, None],
-            config: None,
+            setup: None,
         };
         for path in paths {
             let files = if path.is_dir() { files_of(path)? } else { vec![path.clone()] };
@@ -91,12 +90,9 @@ impl Sources {
                 *slot = Some(pixels);
             }
         }
-        if let (None, Some(text)) = (&self.config, file.metadata.get("parallax")) {
-            let wrong = |why: String| Error::file(&*path, format!("its configuration: {why}"));
-            let config: RunConfig = serde_json::from_str(text).map_err(|e| wrong(e.to_string()))?;
-            config.check().map_err(|e| wrong(e.to_string()))?;
-            self.config = Some(config);
-        }
+        let said =
+            Setup::from_metadata(&file.metadata).map_err(|e| Error::file(&*path, format!("its metadata: {e}")))?;
+        self.setup = self.setup.or(said);
         Ok(())
     }
 
@@ -173,25 +169,18 @@ impl Sources {
         Err(self.error(message))
     }
 
-    /// The configuration to use the weights with: the one they were trained with, where a file says it; otherwise the
-    /// usual one of their size, for pictures of the size that an encoder's file says, or the preset's.
+    /// The setup to use the weights with: the one they were trained with, where a file says it; otherwise the usual one of
+    /// their size, for pictures of the size that an encoder's file says.
     ///
     /// # Errors
-    /// If a file's configuration does not fit its own tensors, or as [`Sources::preset`].
-    pub fn config(&self, need: Need) -> Result<RunConfig> {
-        if let Some(config) = &self.config {
-            return Ok(config.clone());
+    /// As [`Sources::preset`].
+    pub fn setup(&self, need: Need) -> Result<Setup> {
+        if let Some(setup) = self.setup {
+            return Ok(setup);
         }
-        let preset = self.preset(need)?;
-        let (height, width) = match preset {
-            Preset::Pico | Preset::Nano => (96, 320),
-            Preset::Tiny | Preset::Xsmall | Preset::Small | Preset::Base => (192, 640),
-        };
-        let [said_height, said_width] = self.size;
-        let usual = RunConfig::new(preset, 1);
-        // What a run of ours changes in the loss is not known of others.
-        let loss = LossConfig::default();
-        Ok(RunConfig { height: said_height.unwrap_or(height), width: said_width.unwrap_or(width), loss, ..usual })
+        let usual = Setup::of(self.preset(need)?);
+        let [height, width] = self.size;
+        Ok(Setup { height: height.unwrap_or(usual.height), width: width.unwrap_or(usual.width), ..usual })
     }
 
     /// Puts the tensors into a model's parameters: all or none, unless `allow_partial`, which puts in what fits.

@@ -24,11 +24,11 @@ fn batch() -> Batch {
 /// Takes a step, and compares the kernel paths with the checked ones. Gives the weights before and after.
 fn step(ablation: Ablation, change: impl FnOnce(&mut LossConfig)) -> [Params<f32>; 2] {
     let mut config = RunConfig { ablation, height: 64, width: 96, ..RunConfig::new(Preset::Pico, 10) };
-    config.loss.auto_mask_after = 0;
-    config.loss.shake.keep = 0;
+    config.auto_mask_delay = 0.0;
+    config.rotations.keep = 0.0;
     change(&mut config.loss);
     config.check().expect("a configuration that can be run");
-    let mut trainer = Trainer::new(config.model(), config.optim, config.loss, 0);
+    let mut trainer = Trainer::new(config.model(), config.plan());
     let before = trainer.params.clone();
     let batch = batch();
     let (report, entries) = profile::record(false, || trainer.step(&batch));
@@ -120,7 +120,7 @@ fn without_ssim_it_is_not_computed() {
     for (ssim, path) in [(0.85, "rgb"), (0.0, "l1")] {
         let mut config = RunConfig::new(Preset::Pico, 10);
         config.loss.ssim = ssim;
-        let mut trainer = Trainer::new(config.model(), config.optim, config.loss, 0);
+        let mut trainer = Trainer::new(config.model(), config.plan());
         let (_, entries) = profile::record(false, || trainer.step(&batch));
         let photometric: BTreeSet<_> = entries.iter().filter(|e| e.op == "photometric").map(|e| e.algo).collect();
         assert_eq!(photometric, BTreeSet::from([path]));

@@ -10,8 +10,8 @@ use parallax::ops::registry;
 use parallax::street::{Street, StreetConfig};
 use parallax::tensor::parallel;
 use parallax::tensor::profile;
-use parallax::train::RunConfig;
 use parallax::train::Trainer;
+use parallax::train::{Plan, RunConfig};
 
 fn street(height: usize, width: usize) -> Street {
     Street::render(&StreetConfig { height, width, sequences: 1, frames: 6, ..StreetConfig::default() }, None)
@@ -21,9 +21,9 @@ fn street(height: usize, width: usize) -> Street {
 fn paths(preset: Preset, height: usize, width: usize, batch: usize) -> BTreeSet<(&'static str, &'static str)> {
     let street = street(height, width);
     let mut config = RunConfig::new(preset, 10);
-    config.loss.auto_mask_after = 0;
-    config.loss.shake.steps = 1;
-    let mut trainer = Trainer::new(config.model(), config.optim, config.loss, 0);
+    config.auto_mask_delay = 0.0;
+    config.rotations.share = 0.1;
+    let mut trainer = Trainer::new(config.model(), config.plan());
     let batch = batch_of_step(&street, Augment::default(), batch, 0, 0).expect("a batch");
     let (step, mut entries) = profile::record(false, || trainer.step(&batch));
     step.expect("a step");
@@ -32,7 +32,7 @@ fn paths(preset: Preset, height: usize, width: usize, batch: usize) -> BTreeSet<
     assert!(learnt.expect("a lesson"));
     entries.extend(more);
     let image = street.frame(0, 1).clone();
-    let predictor = Predictor::new(&trainer.model, &trainer.params, &config.loss);
+    let predictor = Predictor::new(&trainer.model, &trainer.params, &config.setup());
     entries.extend(profile::record(false, || predictor.disparity(&image)).1);
     entries.extend(profile::record(false, || predictor.inverse_depth(&image, true)).1);
     entries.iter().map(|e| (e.op, e.algo)).collect()
@@ -58,7 +58,7 @@ fn assert_same_bits_on_one_and_two_threads(preset: Preset, height: usize, width:
     let train = |threads: usize| -> Params<f32> {
         parallel::with_threads(threads, || {
             let config = RunConfig::new(preset, 10);
-            let mut trainer = Trainer::new(config.model(), config.optim, config.loss, 7);
+            let mut trainer = Trainer::new(config.model(), Plan { seed: 7, ..config.plan() });
             for step in 0..steps {
                 let batch = batch_of_step(&street, Augment::default(), 2, 7, step).expect("a batch");
                 trainer.step(&batch).expect("a step");
@@ -87,7 +87,7 @@ fn one_and_two_threads_train_the_same_bits_of_the_reduced_network() {
 fn a_number_that_is_not_finite_stops_the_step_and_names_the_op() {
     let street = street(64, 64);
     let config = RunConfig::new(Preset::Pico, 10);
-    let mut trainer = Trainer::new(config.model(), config.optim, config.loss, 0);
+    let mut trainer = Trainer::new(config.model(), config.plan());
     let batch = batch_of_step(&street, Augment::default(), 2, 0, 0).expect("a batch");
     let id = trainer.params.find("encoder.mhca_stages.1.aggregate.conv.weight").expect("a weight");
     trainer.params.value_mut(id).data_mut()[0] = f32::NAN;

@@ -6,12 +6,12 @@ use std::sync::Arc;
 
 use parallax::formats::{TensorFile, safetensors};
 use parallax::monovit::loss::{LossConfig, Views, loss};
+use parallax::monovit::setup::check_size;
 use parallax::monovit::{Config, MonoVit, Preset};
 use parallax::nn::{Context, Folded, Named, fit};
 use parallax::ops::Conv2d;
 use parallax::random::Random;
 use parallax::tensor::{Tape, Tensor, Var};
-use parallax::train::recipe::check_size;
 use parallax::{Error, Result};
 use serde::Serialize;
 

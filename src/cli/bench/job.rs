@@ -71,9 +71,9 @@ impl Network {
         sizes.check()?;
         let mut config = RunConfig::new(sizes.preset, 1_000_000);
         // The step as it is for most of the run.
-        config.loss.auto_mask_after = 0;
-        config.loss.shake.keep = 0;
-        let trainer = Trainer::new(config.model(), config.optim, config.loss, 0);
+        config.auto_mask_delay = 0.0;
+        config.rotations.keep = 0.0;
+        let trainer = Trainer::new(config.model(), config.plan());
         let folded = (!step).then(|| Folded::new(&trainer.params));
         Ok(Network { trainer, batch: batch(sizes), folded })
     }
