@@ -244,16 +244,79 @@ fn a_picture_that_is_too_large_is_refused_at_once() {
 }
 
 #[test]
+fn pictures_of_one_name_keep_what_tells_them_apart() {
+    let place = tempfile::tempdir().expect("a folder");
+    let folder = place.path();
+    let (one, two) = (save(folder, "a/x.png", picture(8, 8)), save(folder, "b/x.png", picture(8, 12)));
+    save(folder, "a/x.jpg", picture(12, 8));
+    let size = |path: PathBuf| image::open(path).expect("a map").dimensions();
+    let out = folder.join("files");
+    predict(&[&one, &two, &one], &out, &[]);
+    assert_eq!((size(out.join("a/x.png_disp.png")), size(out.join("b/x.png_disp.png"))), ((8, 8), (8, 12)));
+    let out = folder.join("stems");
+    predict(&[&folder.join("a")], &out, &[]);
+    assert_eq!((size(out.join("x.jpg_disp.png")), size(out.join("x.png_disp.png"))), ((12, 8), (8, 8)));
+    // Folders of one name, as KITTI's drives have them.
+    let drives = ["drive_1/data", "drive_2/data"].map(|drive| folder.join(drive));
+    drives.iter().for_each(|drive| drop(save(drive, "0000000000.png", picture(8, 8))));
+    let out = folder.join("drives");
+    predict(&[&drives[0], &drives[1]], &out, &[]);
+    for drive in ["drive_1", "drive_2"] {
+        assert!(out.join(drive).join("data/0000000000.png_disp.png").is_file(), "{drive}");
+    }
+}
+
+#[test]
+fn what_is_passed_over_is_named_and_what_is_there_can_be_left_alone() {
+    let place = tempfile::tempdir().expect("a folder");
+    let (folder, out) = (place.path().join("in"), place.path().join("out"));
+    save(&folder, "a.png", picture(8, 8));
+    for name in ["b.heic", "c.mp4", "no_ending"] {
+        fs::write(folder.join(name), "something").expect("written");
+    }
+    let first = run(weights(), &[&folder], &out, &[]);
+    let said = String::from_utf8_lossy(&first.stderr);
+    for word in ["3 files", "b.heic", "c.mp4", "no_ending", "1 of 1 pictures done", "out"] {
+        assert!(said.contains(word), "should say {word:?}: {said}");
+    }
+    fs::write(out.join("a_disp.png"), "mine").expect("written");
+    let second = run(weights(), &[&folder], &out, &["--skip-existing"]);
+    assert!(second.status.success() && String::from_utf8_lossy(&second.stderr).contains("1 were there already"));
+    assert_eq!(fs::read(out.join("a_disp.png")).expect("there"), b"mine");
+}
+
+#[test]
+fn a_picture_that_cannot_be_read_is_named_and_the_rest_of_the_folder_is_done() {
+    let place = tempfile::tempdir().expect("a folder");
+    let (folder, out) = (place.path().join("in"), place.path().join("out"));
+    save(&folder, "a_good.png", picture(8, 8));
+    save(&folder, "z_good.png", picture(8, 8));
+    let bad =
+        ["coarse_brightness.jpg", "coarse_brightness_scans.jpg", "fuzzed_465.jpg", "fuzzed_559.jpg", "trunc_60.jpg"];
+    let pictures = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/pictures");
+    for name in ["coarse_brightness.jpg", "coarse_brightness_scans.jpg", "fuzzed_465.jpg", "fuzzed_559.jpg"] {
+        fs::copy(pictures.join(name), folder.join(name)).expect("copied");
+    }
+    let whole = fs::read(pictures.join("trunc_90.jpg")).expect("a fixture");
+    fs::write(folder.join("trunc_60.jpg"), &whole[..2 * whole.len() / 3]).expect("written");
+    fails(
+        &run(weights(), &[&folder], &out, &[]),
+        1,
+        &[&bad[..], &["5 of 7 pictures", "2 of 7 pictures done"]].concat(),
+    );
+    assert!(out.join("a_good_disp.png").is_file() && out.join("z_good_disp.png").is_file());
+    // A folder that was made for nothing goes.
+    let alone = run(weights(), &[&folder.join("trunc_60.jpg")], &place.path().join("none"), &[]);
+    fails(&alone, 1, &["trunc_60.jpg", "cut short"]);
+    assert!(!place.path().join("none").exists());
+}
+
+#[test]
 fn results_that_would_overwrite_something_are_refused_before_any_work() {
     let place = tempfile::tempdir().expect("a folder");
     let folder = place.path();
     let out = folder.join("out");
     let no_weights = Path::new("/no/such/weights");
-    let (one, two) = (save(folder, "a/x.png", picture(8, 8)), save(folder, "b/x.png", picture(8, 8)));
-    let output = run(no_weights, &[&one, &two], &out, &[]);
-    fails(&output, 1, &["x_disp.png", one.to_str().expect("UTF-8"), two.to_str().expect("UTF-8"), "rename"]);
-    save(folder, "a/x.jpg", picture(8, 8));
-    fails(&run(no_weights, &[&folder.join("a")], &out, &[]), 1, &["x_disp.png", "x.jpg", "x.png"]);
     // A picture that bears the name of another's result.
     let mine = save(folder, "c/y_disp.png", picture(8, 8));
     let before = fs::read(&mine).expect("there");

@@ -5,14 +5,17 @@ use std::path::Path;
 use std::process::{Command, Output};
 use std::sync::Arc;
 
+use parallax::camera::Intrinsics;
 use parallax::data::Dataset;
+use parallax::depth::DepthMap;
+use parallax::formats::safetensors;
 use parallax::monovit::Preset;
 use parallax::monovit::loss::{Reprojection, Scales};
 use parallax::street::{Street, StreetConfig};
 use parallax::train::RunConfig;
 use parallax::train::recipe::read_config;
 use parallax::train::rotations::Rotations;
-use parallax::train::run::{Ended, Event, Run, RunData, load_weights};
+use parallax::train::run::{Ended, Event, Run, RunData, RunMetrics, load_weights};
 
 fn street(seed: u64) -> Arc<dyn Dataset> {
     let config = StreetConfig { height: 64, width: 96, sequences: 1, frames: 8, seed, ..StreetConfig::default() };
@@ -60,25 +63,229 @@ fn a_resumed_run_ends_like_one_that_never_stopped() {
     let data = data();
 
     let ended = Run::create(&whole, config()).expect("a run").train(&data, || false, |_| ()).expect("trained");
-    assert!(matches!(ended, Ended::Finished(Some(_))));
+    assert!(matches!(ended, Ended::Finished(_)));
 
-    // Before the first step; before the first validation; and between two of them.
+    // Before the first step; before the first validation; on a step that is validated; and between two of them.
     let mut run = Run::create(&parts, config()).expect("a run");
     assert_eq!(interrupted(&mut run, &data, |e| matches!(e, Event::Rotations(1, _))), 0);
-    for at in [1, 3] {
+    drop(run);
+    for at in [1, 2, 3, 4] {
         let mut run = Run::resume(&parts).expect("resumed");
         assert_eq!(interrupted(&mut run, &data, |e| matches!(e, Event::Step(r) if r.step == at)), at);
     }
     let ended = Run::resume(&parts).expect("resumed").train(&data, || false, |_| ()).expect("trained");
-    let Ended::Finished(Some(metrics)) = ended else { panic!("not finished") };
+    let Ended::Finished(metrics) = ended else { panic!("not finished") };
 
     assert_eq!(log(&whole), log(&parts));
+    assert_eq!(log(&whole).iter().filter(|line| line["validated"].is_u64()).count(), 3, "after steps 2, 4 and 5");
+    // All but the time, to the last digit.
+    let said = |folder: &Path| {
+        let text = std::fs::read_to_string(folder.join("metrics.json")).expect("metrics");
+        text.lines().filter(|line| !line.contains("\"seconds\"")).map(str::to_owned).collect::<Vec<_>>()
+    };
+    assert_eq!(said(&whole), said(&parts));
     let weights = |folder: &Path| std::fs::read(folder.join("best.safetensors")).expect("weights");
     assert!(weights(&whole) == weights(&parts), "the best weights differ");
-    assert!(metrics.after.abs_rel > 0.0 && metrics.before != metrics.after, "{metrics:?}");
+    assert!(metrics.after.expect("measured").abs_rel > 0.0 && metrics.before != metrics.after, "{metrics:?}");
     for file in ["metrics.json", "config.toml", "images/00.png", "checkpoints/state.safetensors"] {
         assert!(parts.join(file).is_file(), "{file}");
     }
+}
+
+/// A street of which only some frames have depth, and which may have lost a picture.
+struct Patchy {
+    street: Arc<dyn Dataset>,
+    samples: usize,
+    has_depth: fn(usize) -> bool,
+    lost: Option<usize>,
+}
+
+impl Dataset for Patchy {
+    fn len(&self) -> usize {
+        self.samples
+    }
+    fn name(&self, sample: usize) -> String {
+        format!("patchy frame {sample}")
+    }
+    fn image(&self, sample: usize, offset: i32) -> parallax::Result<Arc<image::RgbImage>> {
+        if self.lost == Some(sample) {
+            return Err(parallax::Error::file("lost.png", "cannot be decoded"));
+        }
+        self.street.image(sample, offset)
+    }
+    fn intrinsics(&self, sample: usize) -> Intrinsics {
+        self.street.intrinsics(sample)
+    }
+    fn depth(&self, sample: usize) -> parallax::Result<Option<DepthMap>> {
+        if (self.has_depth)(sample) { self.street.depth(sample) } else { Ok(None) }
+    }
+}
+
+fn patchy(samples: usize, has_depth: fn(usize) -> bool) -> Arc<dyn Dataset> {
+    Arc::new(Patchy { street: street(2), samples, has_depth, lost: None })
+}
+
+/// Trains to the end; the metrics and the warnings.
+fn finished(folder: &Path, config: RunConfig, data: &RunData) -> (RunMetrics, Vec<String>) {
+    let mut warnings = Vec::new();
+    let tell = |event: Event| {
+        if let Event::Warning(what) = event {
+            warnings.push(what.to_owned());
+        }
+    };
+    let ended = Run::create(folder, config).expect("a run").train(data, || false, tell).expect("trained");
+    let Ended::Finished(metrics) = ended else { panic!("not finished") };
+    (*metrics, warnings)
+}
+
+#[test]
+fn frames_without_depth_are_passed_over_and_cost_no_training() {
+    let place = tempfile::tempdir().expect("a folder");
+    let (odd, none) = ((|i| i % 2 == 1) as fn(usize) -> bool, (|_| false) as fn(usize) -> bool);
+    let mixed = RunData { train: patchy(6, odd), validation: patchy(6, odd), test: Some(patchy(6, odd)) };
+    let (metrics, warnings) = finished(&place.path().join("mixed"), config(), &mixed);
+    assert_eq!((metrics.images, warnings), (3, vec![]));
+    assert!(metrics.mean_map.is_some(), "only the first training frame lacks depth");
+    let lines = log(&place.path().join("mixed"));
+    assert!(lines.iter().any(|l| l["abs_rel"].is_f64() && l["a1"].is_f64()), "validated where there is depth");
+
+    let without = RunData { train: patchy(6, none), validation: patchy(6, none), test: Some(patchy(6, none)) };
+    let (metrics, warnings) = finished(&place.path().join("without"), config(), &without);
+    assert_eq!((metrics.images, metrics.before, metrics.after), (0, None, None));
+    assert!(warnings.iter().any(|w| w.contains("ground-truth depth")), "{warnings:?}");
+    assert!(place.path().join("without/metrics.json").is_file());
+}
+
+#[test]
+fn a_run_without_validation_data_keeps_its_last_weights() {
+    let place = tempfile::tempdir().expect("a folder");
+    let data = RunData { validation: patchy(0, |_| true), ..data() };
+    let (metrics, warnings) = finished(&place.path().join("run"), config(), &data);
+    assert!(metrics.after.is_some());
+    assert!(warnings.iter().any(|w| w.contains("no validation data")), "{warnings:?}");
+    load_weights(&place.path().join("run")).expect("weights");
+}
+
+#[test]
+fn a_frame_that_cannot_be_read_stops_the_run_with_its_name_and_keeps_what_was_learnt() {
+    let place = tempfile::tempdir().expect("a folder");
+    let folder = place.path().join("run");
+    // Thirty steps of two see each of six frames; the lost one comes in the first three.
+    let broken = Arc::new(Patchy { street: street(1), samples: 6, has_depth: |_| true, lost: Some(4) });
+    let config = RunConfig { rotations: Rotations::default(), seed: 3, ..config() };
+    let broken = RunData { train: broken, ..data() };
+    let mut run = Run::create(&folder, config).expect("a run");
+    let error = run.train(&broken, || false, |_| ()).err().expect("stopped").to_string();
+    assert!(error.contains("lost.png"), "{error}");
+    let taken = run.steps();
+    drop(run);
+    let mut run = Run::resume(&folder).expect("resumed");
+    assert_eq!(run.steps(), taken, "the steps before it are kept");
+    assert!(matches!(run.train(&data(), || false, |_| ()), Ok(Ended::Finished(_))), "the frame is there again");
+}
+
+#[test]
+fn numbers_that_are_not_finite_are_neither_saved_nor_best() {
+    let place = tempfile::tempdir().expect("a folder");
+    let folder = place.path().join("run");
+    let mut wild = config();
+    (wild.optim.rate, wild.optim.encoder_rate, wild.optim.pose_rate) = (1e38, 1e38, 1e38);
+    (wild.checkpoint_every, wild.rotations) = (1, Rotations::default());
+    wild.optim.schedule.warm_up = 0.0;
+    let error = Run::create(&folder, wild).expect("a run").train(&data(), || false, |_| ()).err().expect("stopped");
+    assert!(error.to_string().contains("step "), "{error}");
+    for file in std::fs::read_dir(folder.join("checkpoints")).expect("a folder").flatten() {
+        let Ok(state) = safetensors::read::<f32>(&file.path()) else { continue };
+        assert!(state.tensors.values().all(|t| t.is_finite()), "{:?}", file.path());
+    }
+    assert!(log(&folder).iter().all(|line| line["best"] != true || line["photometric"].is_f64()));
+}
+
+#[test]
+fn a_damaged_state_is_named_and_the_one_before_it_is_taken() {
+    let place = tempfile::tempdir().expect("a folder");
+    let folder = place.path().join("run");
+    finished(&folder, config(), &data());
+    let state = folder.join("checkpoints/state.safetensors");
+    let mut bytes = std::fs::read(&state).expect("a state");
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 0x10;
+    std::fs::write(&state, &bytes).expect("damaged");
+    let mut told = Vec::new();
+    let run = Run::resume_with(&folder, |_| Ok(()), |what| told.push(what.to_owned())).expect("resumed");
+    assert_eq!(run.steps(), 4, "the checkpoint before the last");
+    assert!(told.len() == 1 && told[0].contains("state.safetensors") && told[0].contains("damaged"), "{told:?}");
+    drop(run);
+    std::fs::remove_file(folder.join("checkpoints/previous.safetensors")).expect("there");
+    let error = Run::resume(&folder).err().expect("refused").to_string();
+    assert!(error.contains("state.safetensors") && error.contains("damaged"), "{error}");
+}
+
+#[test]
+fn a_second_process_is_refused_while_the_first_has_the_run() {
+    let place = tempfile::tempdir().expect("a folder");
+    let folder = place.path().join("run");
+    let first = Run::create(&folder, config()).expect("a run");
+    let error = Run::resume(&folder).err().expect("refused").to_string();
+    assert!(error.contains("another process"), "{error}");
+    drop(first);
+    Run::resume(&folder).expect("the lock is gone with its holder");
+}
+
+#[test]
+fn a_run_that_was_killed_before_its_first_state_can_be_begun_again() {
+    let place = tempfile::tempdir().expect("a folder");
+    std::fs::write(place.path().join("config.toml"), "half").expect("written");
+    std::fs::write(place.path().join(".best.safetensors.1-0.tmp"), "half").expect("written");
+    Run::create(place.path(), config()).expect("a run");
+    let names = std::fs::read_dir(place.path()).expect("a folder").flatten().map(|e| e.file_name());
+    assert!(names.into_iter().all(|name| !name.to_string_lossy().ends_with(".tmp")));
+}
+
+#[test]
+fn an_interrupted_run_has_weights_and_a_finished_one_can_be_prolonged() {
+    let place = tempfile::tempdir().expect("a folder");
+    let folder = place.path().join("run");
+    let data = data();
+    let mut run = Run::create(&folder, config()).expect("a run");
+    assert_eq!(interrupted(&mut run, &data, |e| matches!(e, Event::Step(r) if r.step == 1)), 1);
+    drop(run);
+    load_weights(&folder).expect("weights before the first validation");
+    let mut run = Run::resume(&folder).expect("resumed");
+    assert!(matches!(run.train(&data, || false, |_| ()), Ok(Ended::Finished(_))));
+    drop(run);
+    let prolong = |config: &mut RunConfig| {
+        config.steps = 8;
+        Ok(())
+    };
+    let mut run = Run::resume_with(&folder, prolong, |_| ()).expect("resumed");
+    assert!(matches!(run.train(&data, || false, |_| ()), Ok(Ended::Finished(_))));
+    assert_eq!(run.steps(), 8);
+    assert_eq!(read_config(&folder.join("config.toml")).expect("written").steps, 8);
+}
+
+#[test]
+fn what_a_resumed_run_cannot_take_is_refused_by_name() {
+    let place = tempfile::tempdir().expect("a folder");
+    let folder = place.path().join("run");
+    drop(Run::create(&folder, config()).expect("a run"));
+    let run = folder.to_str().expect("a path in UTF-8");
+    for flags in [
+        &["--learning-rate", "0.1"][..],
+        &["--batch", "3"],
+        &["--seed", "9"],
+        &["--height", "96"],
+        &["--width", "96"],
+        &["--epochs", "2"],
+        &["--val-split", "list.txt"],
+        &["--checkpoint-every", "7"],
+        &["--log-every", "7"],
+        &["--allow-partial"],
+    ] {
+        fails(&[&["train", "--resume", run][..], flags].concat(), 2, &[flags[0], "--resume"]);
+    }
+    fails(&["train", "--resume", run, "--no-auto-mask"], 2, &["ablation", "--resume"]);
+    fails(&["train", "--resume", run, "--data", "/no/such/folder"], 1, &["/no/such/folder"]);
 }
 
 fn parallax(arguments: &[&str]) -> Output {
@@ -177,7 +384,7 @@ fn a_batch_larger_than_the_data_is_refused() {
     let made = parallax(&[&["data", "street", "--out", &street][..], &size].concat());
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
     let small = ["train", "--data", &street, "--preset", "pico", "--height", "64", "--width", "96", "--out", &out];
-    fails(&[&small[..], &["--batch", "5"]].concat(), 1, &["--batch", "5 samples", "holds 4"]);
+    fails(&[&small[..], &["--batch", "5"]].concat(), 2, &["--batch", "5 samples", "holds 4"]);
     assert!(!Path::new(&out).exists(), "nothing was made");
     let split = path("split.txt");
     std::fs::write(&split, "2011_09_26/no_such_drive 3 l\n").expect("written");

@@ -23,6 +23,12 @@ pub struct Networks {
 }
 
 impl Networks {
+    /// Whether any flag is given.
+    pub fn any(&self) -> bool {
+        let numbers = self.transformer_paths.is_some() || self.drop_path.is_some();
+        numbers || self.no_cnn_path || self.no_decoder_attention
+    }
+
     /// Takes away what the flags say.
     pub fn apply(&self, ablation: &mut Ablation) {
         ablation.transformer_paths = self.transformer_paths.or(ablation.transformer_paths);
@@ -59,6 +65,11 @@ pub struct Loss {
 }
 
 impl Loss {
+    /// Whether any flag is given.
+    pub fn any(&self) -> bool {
+        self.no_auto_mask || self.reprojection.is_some() || self.scales.is_some() || self.ssim.is_some()
+    }
+
     /// Changes what the flags say.
     pub fn apply(&self, loss: &mut LossConfig) {
         loss.auto_mask &= !self.no_auto_mask;

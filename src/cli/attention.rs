@@ -5,10 +5,10 @@ use std::str::FromStr;
 
 use image::RgbImage;
 use parallax::data::batch::to_tensor;
-use parallax::data::picture::{check_picture, read_picture};
 use parallax::data::resize::lanczos;
 use parallax::eval::attention::{Attention, AttentionRows, attention, saliency};
 use parallax::formats::atomic::{check_writable, write_bytes_atomically};
+use parallax::formats::picture::{check_picture, read_picture};
 use parallax::report::overlay::{Overlay, mark};
 use parallax::tensor::Tensor;
 use parallax::train::run::load_weights;

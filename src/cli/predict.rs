@@ -6,7 +6,6 @@ use std::time::Instant;
 use image::RgbImage;
 use parallax::camera::Intrinsics;
 use parallax::data::inputs::{Input, find_pictures};
-use parallax::data::picture::read_picture;
 use parallax::data::resize::lanczos;
 use parallax::depth::DepthMap;
 use parallax::eval::camera_height::find_ground;
@@ -15,6 +14,7 @@ use parallax::eval::predictor::Predictor;
 use parallax::formats::atomic::{check_writable, write_bytes_atomically};
 use parallax::formats::depth_png::write_depth_png;
 use parallax::formats::npy::write_npy;
+use parallax::formats::picture::read_picture;
 use parallax::formats::ply::write_point_cloud;
 use parallax::report::colormap::disparity_to_image;
 use parallax::weights::Weights;
@@ -64,6 +64,9 @@ pub struct Args {
     /// Also NAME.ply: every pixel as a coloured point; x right, y down, z forward.
     #[arg(long, help_heading = "Results")]
     ply: bool,
+    /// Leave pictures alone whose results are all there.
+    #[arg(long)]
+    skip_existing: bool,
     /// Predict on the mirrored picture too, and join both: twice the time, better borders.
     #[arg(long, help_heading = "Network")]
     flip: bool,
@@ -162,8 +165,11 @@ struct Failure {
 
 pub fn run(args: Args) -> Result<()> {
     let started = Instant::now();
-    let jobs = jobs(find_pictures(&args.inputs, &args.out)?, &args)?;
+    let found = find_pictures(&args.inputs, &args.out)?;
+    tell_skipped(&found.skipped);
+    let (jobs, there) = left_to_do(jobs(found.pictures, &args)?, args.skip_existing);
     let Weights { model, params, setup, .. } = args.weights.load()?;
+    let made = !args.out.exists();
     check_writable(&args.out)?;
     let predictor = Predictor::new(&model, &params, &setup);
     let size = (setup.height, setup.width);
@@ -193,10 +199,34 @@ pub fn run(args: Args) -> Result<()> {
         let (weights, seconds) = (args.weights.name(), started.elapsed().as_secs_f64());
         super::print_json(&Summary { weights, height: size.0, width: size.1, pictures: done, failed, seconds })?;
     }
+    // A folder that was made for nothing; if it cannot go, what matters is said already.
+    if made && failures == all {
+        let _ = std::fs::remove_dir(&args.out);
+    }
+    let kept = if there > 0 { format!(", {there} were there already") } else { String::new() };
+    note!("{} of {} pictures done{kept}; the results are in {}", all - failures, all + there, args.out.display());
     match failures {
         0 => Ok(()),
         n => Err(Error::Failed(format!("{n} of {all} pictures could not be done (see above)"))),
     }
+}
+
+/// The pictures whose results are not all there, and how many are, if those are to be left alone.
+fn left_to_do(jobs: Vec<Job>, skip_existing: bool) -> (Vec<Job>, usize) {
+    let all = jobs.len();
+    let left: Vec<Job> = jobs.into_iter().filter(|job| !(skip_existing && job.outputs.exist())).collect();
+    let there = all - left.len();
+    (left, there)
+}
+
+/// Names the files of folders that are no pictures.
+fn tell_skipped(skipped: &[PathBuf]) {
+    if skipped.is_empty() {
+        return;
+    }
+    let first: Vec<String> = skipped.iter().take(5).map(|path| path.display().to_string()).collect();
+    let more = if skipped.len() > first.len() { ", ..." } else { "" };
+    note!("{} files are no PNG, JPEG or WebP and are passed over: {}{more}", skipped.len(), first.join(", "));
 }
 
 fn predict(args: &Args, predictor: &Predictor, job: Job, (height, width): (usize, usize)) -> Result<Done> {
@@ -205,6 +235,10 @@ fn predict(args: &Args, predictor: &Predictor, job: Job, (height, width): (usize
     let (w, h) = (picture.width() as usize, picture.height() as usize);
     let camera = args.camera(w as f64, h as f64);
     let map = predictor.inverse_depth(&lanczos(&picture, width as u32, height as u32), args.flip);
+    if !map.iter().all(|d| d.is_finite() && *d > 0.0) {
+        let message = "the network's depth of it is not finite: the weights are broken";
+        return Err(Error::file(&job.input.path, message));
+    }
     let factor = args.factor(&job.input, &map, (height, width), camera)?;
     let median_depth = median(map.iter().map(|&d| factor / f64::from(d)).collect()).unwrap_or(f64::NAN);
     let inverse = resize_bilinear(&map, (height, width), (h, w));

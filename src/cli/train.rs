@@ -1,18 +1,16 @@
 //! `parallax train`.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Instant;
 
-use parallax::data::kitti::{Kitti, Options};
-use parallax::data::{Dataset, Subset};
-use parallax::eval::metrics::Metrics;
-use parallax::monovit::Preset;
-use parallax::street::{Street, StreetConfig};
+use parallax::monovit::{Preset, Setup};
+use parallax::train::data::{self, STREET};
 use parallax::train::recipe::{RunConfig, STEPS, read_config};
 use parallax::train::run::{Ended, Event, Run, RunData, RunMetrics};
 use parallax::train::start::Start;
-use parallax::weights::preset_of;
+use parallax::weights::{self, preset_of};
 use parallax::{Error, Result};
 
 use super::ablation;
@@ -20,7 +18,7 @@ use super::progress::Progress;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Where frames come from: `street` (made by the program) or a folder in the layout of KITTI raw.
+    /// Where frames come from: `street` (made by the program, the default) or a folder in the layout of KITTI raw.
     #[arg(long, value_name = "street|DIR")]
     data: Option<String>,
     /// The frames of a folder to train on: lines `FOLDER FRAME SIDE`. All that have neighbours, without.
@@ -29,28 +27,35 @@ pub struct Args {
     /// The frames of a folder to validate on. Every tenth training frame is set aside, without.
     #[arg(long, value_name = "FILE")]
     val_split: Option<PathBuf>,
-    /// The size of the networks.
+    /// The size of the networks; that of the weights to start from, or nano, unless given.
     #[arg(long)]
     preset: Option<Preset>,
-    /// Height of the pictures that the networks see, a multiple of 32.
+    /// Height of the pictures that the networks see, a multiple of 32; that of the weights to start from, or 96.
     #[arg(long, value_name = "PIXELS")]
     height: Option<usize>,
-    /// Width of the pictures that the networks see, a multiple of 32.
+    /// Width of the pictures that the networks see, a multiple of 32; that of the weights to start from, or 320.
     #[arg(long, value_name = "PIXELS")]
     width: Option<usize>,
-    /// Samples a step.
+    /// Batch size: how many samples a step sees; 4 unless given.
     #[arg(long, value_name = "N")]
     batch: Option<usize>,
-    /// How many steps.
+    /// Number of training steps; 3800 unless given. With --resume, the number to go on to.
     #[arg(long, value_name = "N", conflicts_with = "epochs")]
     steps: Option<u64>,
+    /// A line in the log every so many steps; 10 unless given.
+    #[arg(long, value_name = "N")]
+    log_every: Option<u64>,
+    /// The state is written and the weights are validated every so many steps; 200 unless given.
+    #[arg(long, value_name = "N")]
+    checkpoint_every: Option<u64>,
     /// How many times through the data, instead of steps.
     #[arg(long, value_name = "N")]
     epochs: Option<u64>,
-    /// The learning rate of the depth decoder; those of the encoder and of the pose networks keep their ratio to it.
+    /// The learning rate of the depth decoder, 0.001 (0.0001 where training starts from weights) unless given; those of
+    /// the encoder and of the pose networks keep their ratio to it.
     #[arg(long, value_name = "RATE")]
     learning_rate: Option<f64>,
-    /// Everything random follows from this number.
+    /// The seed that everything random follows from; 0 unless given.
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
     /// A configuration such as a run's config.toml; flags win over it.
@@ -70,7 +75,7 @@ pub struct Args {
     #[arg(long)]
     allow_partial: bool,
     /// Go on with an interrupted run.
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "config", "init", "init_encoder", "init_pose", "data", "split", "preset"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "config", "init", "init_encoder", "init_pose", "split", "preset"])]
     resume: Option<PathBuf>,
     /// The run's folder, new or empty.
     #[arg(long, value_name = "RUN")]
@@ -85,53 +90,10 @@ pub struct Args {
 }
 
 pub fn run(args: Args) -> Result<()> {
-    let stop = Arc::new(AtomicBool::new(false));
-    let asked = stop.clone();
-    ctrlc::set_handler(move || {
-        // The second time, at once.
-        if asked.swap(true, Ordering::SeqCst) {
-            std::process::exit(130);
-        }
-        note!("\nstopping after this step; once more to stop at once");
-    })
-    .map_err(|e| Error::Failed(format!("Ctrl-C cannot be caught: {e}")))?;
-
+    let stop = catch_stop()?;
     let (mut run, data) = match &args.resume {
-        Some(folder) => {
-            let run = Run::resume(folder)?;
-            let data = open(&run.config)?;
-            (run, data)
-        }
-        None => {
-            let mut config = configuration(&args)?;
-            config.check()?;
-            // Weights that do not fit are found out before anything is rendered or made.
-            let start = Start::of(&config)?;
-            for (files, report) in &start.reports {
-                let files: Vec<String> = files.iter().map(|f| f.display().to_string()).collect();
-                note!("starting from {}", files.join(", "));
-                if report.problem().is_some() {
-                    note!("{report}");
-                }
-            }
-            let folder = args.out.clone().unwrap_or_else(|| next_free("runs"));
-            let made = !folder.exists();
-            Run::claim(&folder)?;
-            let prepared = open(&config).and_then(|data| {
-                enough(&data, &config)?;
-                if let Some(epochs) = args.epochs {
-                    let a_pass = data.train.len().div_ceil(config.batch.max(1)) as u64;
-                    config.steps = epochs * a_pass;
-                }
-                Ok((Run::create_from(&folder, config, start)?, data))
-            });
-            prepared.inspect_err(|_| {
-                // A folder made for nothing; if it cannot go, the error above says what matters.
-                if made {
-                    let _ = std::fs::remove_dir(&folder);
-                }
-            })?
-        }
+        Some(folder) => resume(&args, folder)?,
+        None => create(&args)?,
     };
     note!(
         "training {} on {} samples, {} steps of {}; everything goes to {}",
@@ -141,52 +103,135 @@ pub fn run(args: Args) -> Result<()> {
         run.config.batch,
         run.folder.display()
     );
+    let began = Instant::now();
     let mut progress = Progress::new("training", run.config.steps);
-    let ended = run.train(
-        &data,
-        || stop.load(Ordering::SeqCst),
-        |event| match event {
-            Event::Phase(what) => progress.say(what),
-            Event::Rotations(step, error) => {
-                if step % 50 == 0 {
-                    progress.say(&format!("  step {step}: mean error {error:.2} pixels"));
-                }
-            }
-            Event::Step(r) => {
-                let note = format!("loss {:.4} photometric {:.4} (unwarped {:.4})", r.loss, r.photometric, r.unwarped);
-                progress.set(r.step, &note);
-            }
-            Event::Validated(v) => {
-                let abs_rel = v.abs_rel.map_or_else(String::new, |a| format!(", Abs Rel {a:.4}"));
-                let best = if v.best { ", the best so far" } else { "" };
-                let (step, error) = (v.step, v.photometric);
-                progress.say(&format!("step {step}: photometric error on validation data {error:.4}{best}{abs_rel}"));
-            }
-        },
-    )?;
+    let ended = run.train(&data, || stop.asked.load(Ordering::SeqCst), |event| show(&event, &mut progress, &stop))?;
+    stop.waits.store(false, Ordering::SeqCst);
     progress.finish();
     let folder = run.folder.display();
     match ended {
         Ended::Interrupted(step) => {
             note!("stopped after step {step}; go on with: parallax train --resume {folder}");
+            // As the shell says it of a program that Ctrl-C ended: scripts can tell this from done.
+            std::process::exit(130);
         }
-        Ended::Finished(None) => {
-            note!(
-                "done; no frame that was set aside has ground-truth depth to measure against. Look at {folder}/images"
-            );
-        }
-        Ended::Finished(Some(metrics)) => {
+        Ended::Finished(metrics) => {
             if args.json {
                 super::print_json(&metrics)?;
             }
-            print_metrics(&metrics);
-            note!("done in {:.0} s; look at {folder}/images", metrics.seconds);
+            let start = if run.config.init.is_empty() { "untrained" } else { "start" };
+            print_metrics(&metrics, start);
+            let seconds = began.elapsed().as_secs_f64();
+            note!("done in {seconds:.0} s, {:.0} s of them training; look at {folder}/images", metrics.seconds);
         }
     }
     Ok(())
 }
 
-fn print_metrics(m: &RunMetrics) {
+/// Ctrl-C: whether it was pressed, and whether there is a step to be waited for.
+struct Stop {
+    asked: AtomicBool,
+    waits: AtomicBool,
+}
+
+/// Catches Ctrl-C and SIGTERM. Where nothing would be lost the program ends at once; while steps are taken, after the
+/// present one; the second time, at once.
+fn catch_stop() -> Result<Arc<Stop>> {
+    let stop = Arc::new(Stop { asked: AtomicBool::new(false), waits: AtomicBool::new(false) });
+    let handler = stop.clone();
+    ctrlc::set_handler(move || {
+        if !handler.waits.load(Ordering::SeqCst) || handler.asked.swap(true, Ordering::SeqCst) {
+            std::process::exit(130);
+        }
+        note!("\nstopping after this step; once more to stop at once");
+    })
+    .map_err(|e| Error::Failed(format!("Ctrl-C cannot be caught: {e}")))?;
+    Ok(stop)
+}
+
+fn show(event: &Event, progress: &mut Progress, stop: &Stop) {
+    match event {
+        Event::Phase(what) => {
+            // In all other phases what is done so far is on the disk.
+            stop.waits.store(*what == "training", Ordering::SeqCst);
+            progress.say(what);
+        }
+        Event::Rotations(step, error) => {
+            if step % 50 == 0 {
+                progress.say(&format!("  step {step}: mean error {error:.2} pixels"));
+            }
+        }
+        Event::Step(r) => {
+            progress.set(r.step, &format!("loss {:.4} warped {:.4} (unwarped {:.4})", r.loss, r.warped, r.unwarped));
+        }
+        Event::Validated(v) => {
+            let abs_rel = v.abs_rel.map_or_else(String::new, |a| format!(", Abs Rel {a:.4}"));
+            let best = if v.best { ", the best so far" } else { "" };
+            progress.say(&format!(
+                "step {}: on validation data photometric error {:.4}{best}; warped {:.4}, unwarped {:.4}{abs_rel}",
+                v.validated, v.photometric, v.warped, v.unwarped
+            ));
+        }
+        Event::Warning(what) => progress.say(&format!("warning: {what}")),
+    }
+}
+
+/// A new run.
+fn create(args: &Args) -> Result<(Run, RunData)> {
+    let mut config = configuration(args)?;
+    config.check()?;
+    // Weights that do not fit are found out before anything is rendered or made.
+    let start = Start::of(&config)?;
+    for (files, report) in &start.reports {
+        let files: Vec<String> = files.iter().map(|f| f.display().to_string()).collect();
+        note!("starting from {}", files.join(", "));
+        if report.problem().is_some() {
+            note!("{report}");
+        }
+    }
+    let folder = args.out.clone().unwrap_or_else(|| next_free("runs"));
+    let made = !folder.exists();
+    Run::claim(&folder)?;
+    let prepared = open(&config).and_then(|data| {
+        if let Some(epochs) = args.epochs {
+            config.steps = epochs.saturating_mul(data.train.len().div_ceil(config.batch.max(1)) as u64);
+        }
+        Ok((Run::create_from(&folder, config, start)?, data))
+    });
+    prepared.inspect_err(|_| {
+        // A folder made for nothing; if it cannot go, the error above says what matters.
+        if made {
+            let _ = std::fs::remove_dir(&folder);
+        }
+    })
+}
+
+/// A run that goes on, where its data are now and to as many steps as are asked for.
+fn resume(args: &Args, folder: &Path) -> Result<(Run, RunData)> {
+    args.refuse_what_cannot_change()?;
+    let change = |config: &mut RunConfig| {
+        if let Some(data) = &args.data {
+            config.data = absolute(data);
+        }
+        if let Some(steps) = args.steps {
+            config.steps = steps;
+        }
+        Ok(())
+    };
+    let run = Run::resume_with(folder, change, |warning| note!("warning: {warning}"))?;
+    if run.steps() > run.config.steps {
+        let message = format!("{} steps, but the run has taken {} already", run.config.steps, run.steps());
+        return Err(Error::setting("--steps", message));
+    }
+    note!("going on from step {} to {}", run.steps(), run.config.steps);
+    let data = open(&run.config)?;
+    Ok((run, data))
+}
+
+fn print_metrics(m: &RunMetrics, start: &str) {
+    if m.images == 0 {
+        return note!("no frame that was set aside has ground-truth depth to measure against");
+    }
     note!("\n{} images that nothing was chosen on ({})", m.images, m.test);
     note!(
         "{:14} {:>8} {:>8} {:>8} {:>9} {:>6} {:>6} {:>6}",
@@ -199,34 +244,75 @@ fn print_metrics(m: &RunMetrics) {
         "a2",
         "a3"
     );
-    let row = |name: &str, m: &Metrics| {
-        note!(
-            "{name:14} {:8.4} {:8.4} {:8.3} {:9.4} {:6.3} {:6.3} {:6.3}",
-            m.abs_rel,
-            m.sq_rel,
-            m.rmse,
-            m.rmse_log,
-            m.a1,
-            m.a2,
-            m.a3
-        );
-    };
-    row("untrained", &m.before);
-    if let Some(mean_map) = &m.mean_map {
-        row("mean depth map", mean_map);
+    for (name, metrics) in [(start, &m.before), ("mean depth map", &m.mean_map), ("trained", &m.after)] {
+        if let Some(m) = metrics {
+            note!(
+                "{name:14} {:8.4} {:8.4} {:8.3} {:9.4} {:6.3} {:6.3} {:6.3}",
+                m.abs_rel,
+                m.sq_rel,
+                m.rmse,
+                m.rmse_log,
+                m.a1,
+                m.a2,
+                m.a3
+            );
+        }
     }
-    row("trained", &m.after);
+}
+
+impl Args {
+    /// Of a run that goes on, only where its data are and how many steps it takes can be said anew.
+    fn refuse_what_cannot_change(&self) -> Result<()> {
+        let given = [
+            ("--height", self.height.is_some()),
+            ("--width", self.width.is_some()),
+            ("--batch", self.batch.is_some()),
+            ("--epochs", self.epochs.is_some()),
+            ("--learning-rate", self.learning_rate.is_some()),
+            ("--seed", self.seed.is_some()),
+            ("--val-split", self.val_split.is_some()),
+            ("--allow-partial", self.allow_partial),
+            ("--log-every", self.log_every.is_some()),
+            ("--checkpoint-every", self.checkpoint_every.is_some()),
+            ("an ablation", self.networks.any() || self.loss.any()),
+        ];
+        match given.into_iter().find(|(_, given)| *given) {
+            Some((flag, _)) => {
+                let message = "cannot be changed with --resume: it is part of the run. A new run can start from its \
+                               weights with --init RUN";
+                Err(Error::setting(flag, message))
+            }
+            None => Ok(()),
+        }
+    }
+}
+
+/// A path that means the same from any folder.
+fn absolute(data: &str) -> String {
+    if data == STREET {
+        return data.to_owned();
+    }
+    std::path::absolute(data).map_or_else(|_| data.to_owned(), |p| p.to_string_lossy().into_owned())
 }
 
 fn configuration(args: &Args) -> Result<RunConfig> {
     let mut c = match &args.config {
         Some(path) => read_config(path)?,
+        None if !args.init.is_empty() && args.preset.is_none() => {
+            RunConfig::from_weights(weights::setup_of(&args.init)?, STEPS)
+        }
+        None if !args.init.is_empty() => {
+            let preset = preset(args)?;
+            RunConfig::from_weights(Setup::of(preset), STEPS)
+        }
+        None if args.init_encoder.is_some() => RunConfig::from_encoder(preset(args)?, STEPS),
         None => RunConfig::new(preset(args)?, STEPS),
     };
     macro_rules! take {
         ($($field:ident),*) => {$(if let Some(value) = args.$field.clone() { c.$field = value; })*};
     }
-    take!(data, preset, height, width, batch, seed);
+    take!(data, preset, height, width, batch, seed, steps, log_every, checkpoint_every);
+    c.data = absolute(&c.data);
     for (to, from) in [
         (&mut c.split, &args.split),
         (&mut c.val_split, &args.val_split),
@@ -236,9 +322,12 @@ fn configuration(args: &Args) -> Result<RunConfig> {
         if from.is_some() {
             *to = from.clone();
         }
+        if let Some(path) = to {
+            *path = std::path::absolute(&*path).unwrap_or_else(|_| path.clone());
+        }
     }
     if !args.init.is_empty() {
-        c.init.clone_from(&args.init);
+        c.init = args.init.iter().map(|p| std::path::absolute(p).unwrap_or_else(|_| p.clone())).collect();
     }
     c.allow_partial |= args.allow_partial;
     args.networks.apply(&mut c.ablation);
@@ -251,9 +340,6 @@ fn configuration(args: &Args) -> Result<RunConfig> {
         c.optim.rate = rate;
         c.optim.encoder_rate *= factor;
         c.optim.pose_rate *= factor;
-    }
-    if let Some(steps) = args.steps {
-        c.steps = steps;
     }
     Ok(c)
 }
@@ -273,60 +359,19 @@ fn next_free(parent: &str) -> PathBuf {
     (1..).map(|i| Path::new(parent).join(i.to_string())).find(|p| !p.exists()).expect("numbers do not end")
 }
 
-fn enough(data: &RunData, config: &RunConfig) -> Result<()> {
-    if data.train.len() < config.batch {
-        let message =
-            format!("{} samples a batch, but the data holds {}: make it smaller", config.batch, data.train.len());
-        return Err(Error::setting("--batch", message));
-    }
-    Ok(())
-}
-
-/// Opens what a run trains, validates and reports on.
+/// Opens what a run trains, validates and reports on, with a bar for what has to be rendered.
 fn open(config: &RunConfig) -> Result<RunData> {
-    let (height, width) = (config.height, config.width);
-    if config.data == "street" {
-        // Many short drives: a street more teaches more than a few metres more of the same.
-        let street = |what: &'static str, seed: u64, sequences: usize| {
-            let settings = StreetConfig { height, width, sequences, frames: 10, seed, ..StreetConfig::default() };
-            let progress = std::sync::Mutex::new(Progress::new(what, (sequences * settings.frames) as u64));
-            let report = |done: usize, _: usize| {
-                if let Ok(mut progress) = progress.lock() {
-                    progress.set(done as u64, "");
-                }
-            };
-            let street = Street::render(&settings, Some(&report));
-            if let Ok(progress) = progress.lock() {
+    let bar: Mutex<Option<(&'static str, Progress)>> = Mutex::new(None);
+    data::open(config, &|what, done, all| {
+        let Ok(mut bar) = bar.lock() else { return };
+        if bar.as_ref().is_none_or(|(of, _)| *of != what) {
+            *bar = Some((what, Progress::new(what, all as u64)));
+        }
+        if let Some((_, progress)) = bar.as_mut() {
+            progress.set(done as u64, "");
+            if done == all {
                 progress.finish();
             }
-            Arc::new(street)
-        };
-        // Seeds far apart: three worlds that have no street in common.
-        let seed = config.seed;
-        return Ok(RunData {
-            train: street("street", seed, 144),
-            validation: street("validation", seed + 1_000_000, 12),
-            test: Some(street("test", seed + 2_000_000, 24)),
-        });
-    }
-    let root = Path::new(&config.data);
-    let all: Arc<dyn Dataset> =
-        Arc::new(Kitti::open(root, config.split.as_deref(), height, width, Options::default())?);
-    let (train, aside): (Arc<dyn Dataset>, Arc<dyn Dataset>) = match &config.val_split {
-        Some(split) => (all, Arc::new(Kitti::open(root, Some(split), height, width, Options::default())?)),
-        None => {
-            let (aside, rest) = (0..all.len()).partition(|i| i % 10 == 9);
-            (Arc::new(Subset::new(all.clone(), rest)), Arc::new(Subset::new(all, aside)))
         }
-    };
-    // What selects the weights is not what is reported on.
-    let (validation, mut test): (Vec<usize>, Vec<usize>) = (0..aside.len()).partition(|i| i % 2 == 0);
-    let with_truth: Result<Vec<bool>> = test.iter().map(|&i| Ok(aside.depth(i)?.is_some())).collect();
-    let mut with_truth = with_truth?.into_iter();
-    test.retain(|_| with_truth.next().unwrap_or(false));
-    Ok(RunData {
-        train,
-        validation: Arc::new(Subset::new(aside.clone(), validation)),
-        test: (!test.is_empty()).then(|| Arc::new(Subset::new(aside, test)) as Arc<dyn Dataset>),
     })
 }

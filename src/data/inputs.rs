@@ -1,6 +1,7 @@
 //! Which pictures the arguments of a command mean, in which order, and what is made of each is called.
 
 use std::cmp::Ordering;
+use std::collections::HashSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -19,6 +20,15 @@ pub struct Input {
     pub name: PathBuf,
 }
 
+/// The pictures that were found, and what lies among them that is none.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Found {
+    /// The pictures, in order; no two have one name.
+    pub pictures: Vec<Input>,
+    /// The other files in the folders, but for hidden ones.
+    pub skipped: Vec<PathBuf>,
+}
+
 /// The pictures that `inputs` mean: files as they are given, and all PNG, JPEG and WebP files in folders and the
 /// folders inside them, in the order in which people number them. Hidden files and folders, links to folders, and `out`
 /// (where results go) are passed over.
@@ -27,10 +37,10 @@ pub struct Input {
 ///
 /// # Errors
 /// If a folder cannot be read, holds no picture, or is `out` itself.
-pub fn find_pictures(inputs: &[PathBuf], out: &Path) -> Result<Vec<Input>> {
+pub fn find_pictures(inputs: &[PathBuf], out: &Path) -> Result<Found> {
     // A folder that does not exist yet holds no results.
     let out = fs::canonicalize(out).ok();
-    let mut all = Vec::new();
+    let (mut all, mut skipped) = (Vec::new(), Vec::new());
     for input in inputs {
         if !input.is_dir() {
             let name = input.file_stem().ok_or_else(|| Error::file(input, "expected a picture or a folder"))?;
@@ -42,22 +52,81 @@ pub fn find_pictures(inputs: &[PathBuf], out: &Path) -> Result<Vec<Input>> {
             let message = "results are not written among the pictures of a folder: give another --out";
             return Err(Error::file(input, message));
         }
-        let mut inside = Vec::new();
-        walk(input, Path::new(""), out.as_deref(), &mut inside)?;
+        let (mut inside, mut others) = (Vec::new(), Vec::new());
+        walk(input, Path::new(""), out.as_deref(), &mut inside, &mut others)?;
         if inside.is_empty() {
-            return Err(Error::file(input, "holds no PNG, JPEG or WebP pictures"));
+            let others = match others.len() {
+                0 => String::new(),
+                n => format!(", but {n} other files, such as {}", others[0].display()),
+            };
+            return Err(Error::file(input, format!("holds no PNG, JPEG or WebP pictures{others}")));
         }
+        others.sort_by(|a, b| natural_order_of_paths(a, b));
+        skipped.extend(others.into_iter().map(|other| input.join(other)));
         inside.sort_by(|a, b| natural_order_of_paths(a, b));
         let own =
             if inputs.len() > 1 { root.file_name().map(PathBuf::from).unwrap_or_default() } else { PathBuf::new() };
         let picture = |inside: PathBuf| Input { path: input.join(&inside), name: own.join(inside.with_extension("")) };
         all.extend(inside.into_iter().map(picture));
     }
-    Ok(all)
+    Ok(Found { pictures: with_names_of_their_own(all), skipped })
 }
 
-/// Adds the pictures below `root/inside` to `found`, as paths below `root`.
-fn walk(root: &Path, inside: &Path, out: Option<&Path>, found: &mut Vec<PathBuf>) -> Result<()> {
+/// Gives pictures of one name their endings back, and the folders that they lie in as far as that is needed; what is given
+/// twice is one picture.
+fn with_names_of_their_own(pictures: Vec<Input>) -> Vec<Input> {
+    let mut paths = HashSet::new();
+    let same = |input: &Input| fs::canonicalize(&input.path).unwrap_or_else(|_| input.path.clone());
+    let mut pictures: Vec<Input> = pictures.into_iter().filter(|input| paths.insert(same(input))).collect();
+    // Case is no difference to some file systems.
+    let key = |name: &Path| name.to_string_lossy().to_lowercase();
+    let clashes = |pictures: &[Input]| -> HashSet<String> {
+        let (mut seen, mut twice) = (HashSet::new(), HashSet::new());
+        for input in pictures {
+            if !seen.insert(key(&input.name)) {
+                twice.insert(key(&input.name));
+            }
+        }
+        twice
+    };
+    let shared = clashes(&pictures);
+    for input in pictures.iter_mut().filter(|input| shared.contains(&key(&input.name))) {
+        if let Some(ending) = input.path.extension() {
+            let mut name = input.name.clone().into_os_string();
+            name.push(".");
+            name.push(ending);
+            input.name = name.into();
+        }
+    }
+    for above in 1.. {
+        let shared = clashes(&pictures);
+        if shared.is_empty() {
+            break;
+        }
+        let mut changed = false;
+        for input in pictures.iter_mut().filter(|input| shared.contains(&key(&input.name))) {
+            let path = same(input);
+            let folder = path.ancestors().nth(input.name.components().count() + above - 1).and_then(Path::file_name);
+            if let Some(folder) = folder {
+                input.name = Path::new(folder).join(&input.name);
+                changed = true;
+            }
+        }
+        if !changed {
+            break;
+        }
+    }
+    pictures
+}
+
+/// Adds the pictures below `root/inside` to `found`, and all other files to `others`, as paths below `root`.
+fn walk(
+    root: &Path,
+    inside: &Path,
+    out: Option<&Path>,
+    found: &mut Vec<PathBuf>,
+    others: &mut Vec<PathBuf>,
+) -> Result<()> {
     let folder = root.join(inside);
     if out.is_some() && fs::canonicalize(&folder).ok().as_deref() == out {
         return Ok(());
@@ -72,9 +141,9 @@ fn walk(root: &Path, inside: &Path, out: Option<&Path>, found: &mut Vec<PathBuf>
         let path = inside.join(name);
         // Links to folders are not followed: they may lead in circles.
         if kind.is_dir() {
-            walk(root, &path, out, found)?;
-        } else if is_picture(&path) && entry.path().is_file() {
-            found.push(path);
+            walk(root, &path, out, found, others)?;
+        } else if entry.path().is_file() {
+            if is_picture(&path) { found.push(path) } else { others.push(path) }
         }
     }
     Ok(())
@@ -130,7 +199,7 @@ mod tests {
 
     fn names(inputs: &[PathBuf], out: &Path) -> Vec<String> {
         let found = find_pictures(inputs, out).unwrap();
-        found.iter().map(|i| i.name.to_str().unwrap().replace('\\', "/")).collect()
+        found.pictures.iter().map(|i| i.name.to_str().unwrap().replace('\\', "/")).collect()
     }
 
     #[test]

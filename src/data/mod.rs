@@ -4,7 +4,6 @@ pub mod augment;
 pub mod batch;
 pub mod inputs;
 pub mod kitti;
-pub mod picture;
 pub mod pyramid;
 pub mod resize;
 

@@ -330,6 +330,8 @@ pub struct Report {
     pub per_image: Vec<PerImage>,
     /// The images whose ground truth has not a single pixel that counts: they are in none of the numbers.
     pub without_pixels: Vec<String>,
+    /// The images that have no ground truth at all: they are in none of the numbers either.
+    pub without_depth: Vec<String>,
 }
 
 impl Report {
@@ -357,7 +359,15 @@ impl Report {
         let ratios: Vec<f64> = per_image.iter().filter_map(|image| image.ratio).collect();
         let ratio_median = median(ratios.clone());
         let ratio_std = ratio_median.map(|m| standard_deviation(ratios.iter().map(|r| r / m)));
-        Ok(Report { images: per_image.len(), metrics, ratio_median, ratio_std, per_image, without_pixels })
+        Ok(Report {
+            images: per_image.len(),
+            metrics,
+            ratio_median,
+            ratio_std,
+            per_image,
+            without_pixels,
+            without_depth: Vec::new(),
+        })
     }
 }
 

@@ -55,44 +55,55 @@ impl<'a> Predictor<'a> {
     }
 }
 
-/// The seven metrics of a network on a data set; `seen` is told how many samples are done.
+/// The seven metrics of a network on a data set; `seen` is told how many samples are done. Samples without ground truth
+/// are passed over and named in the report.
 ///
 /// # Errors
-/// If a sample has no ground truth, or cannot be read.
+/// If no sample has ground truth, or one cannot be read.
 pub fn evaluate(
     predictor: &Predictor,
     data: &dyn Dataset,
     samples: &[usize],
     how: Evaluation,
-    mut seen: impl FnMut(usize),
+    seen: impl FnMut(usize),
 ) -> Result<Report> {
-    let mut results = Vec::new();
-    for (i, &sample) in samples.iter().enumerate() {
+    compare(data, samples, how, seen, |sample| {
         let image = data.image(sample, 0)?;
-        let prediction = predictor.inverse_depth(&image, how.flip);
-        results.push(compare(data, sample, &prediction, (image.height() as usize, image.width() as usize), how)?);
-        seen(i + 1);
-    }
-    Report::new(results)
+        Ok((predictor.inverse_depth(&image, how.flip), (image.height() as usize, image.width() as usize)))
+    })
 }
 
-/// The seven metrics of the mean depth map on a data set.
+/// The seven metrics of the mean depth map on a data set; as [`evaluate`].
+///
+/// # Errors
+/// As [`evaluate`].
 pub fn evaluate_mean_map(map: &MeanMap, data: &dyn Dataset, samples: &[usize], how: Evaluation) -> Result<Report> {
-    let results: Result<Vec<_>> =
-        samples.iter().map(|&sample| compare(data, sample, &map.inverse_depth, map.size, how)).collect();
-    Report::new(results?)
+    compare(data, samples, how, |_| (), |_| Ok((map.inverse_depth.clone(), map.size)))
 }
 
+/// Compares predictions (inverse depth and its rows and columns) with the ground truth of those samples that have one.
 fn compare(
     data: &dyn Dataset,
-    sample: usize,
-    inverse_depth: &[f32],
-    size: (usize, usize),
+    samples: &[usize],
     how: Evaluation,
-) -> Result<(String, super::metrics::ImageMetrics)> {
-    let name = data.name(sample);
-    let truth = data.depth(sample)?;
-    let truth = truth.ok_or_else(|| Error::Failed(format!("{name}: no ground-truth depth to compare with")))?;
-    let found = evaluate_image(inverse_depth, size, &truth, how.protocol, how.scale)?;
-    Ok((name, found))
+    mut seen: impl FnMut(usize),
+    predict: impl Fn(usize) -> Result<(Vec<f32>, (usize, usize))>,
+) -> Result<Report> {
+    let (mut results, mut without_depth) = (Vec::new(), Vec::new());
+    for (i, &sample) in samples.iter().enumerate() {
+        match data.depth(sample)? {
+            Some(truth) => {
+                let (inverse_depth, size) = predict(sample)?;
+                let found = evaluate_image(&inverse_depth, size, &truth, how.protocol, how.scale)?;
+                results.push((data.name(sample), found));
+            }
+            None => without_depth.push(data.name(sample)),
+        }
+        seen(i + 1);
+    }
+    if results.is_empty() {
+        let message = format!("nothing to evaluate: none of the {} frames has ground-truth depth", samples.len());
+        return Err(Error::Failed(message));
+    }
+    Ok(Report { without_depth, ..Report::new(results)? })
 }

@@ -2,10 +2,35 @@
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::{Error, Result};
+
+/// A name in the folder of `path`, which is made if it is missing, that no other writer uses.
+fn aside(path: &Path) -> Result<PathBuf> {
+    static COUNTER: AtomicU64 = AtomicU64::new(0);
+    let Some(name) = path.file_name() else {
+        return Err(Error::file(path, "expected the name of a file to write"));
+    };
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
+    let number = COUNTER.fetch_add(1, Ordering::Relaxed);
+    Ok(folder.join(format!(".{}.{}-{number}.tmp", name.to_string_lossy(), std::process::id())))
+}
+
+/// Removes what killed writers left in a folder: nobody else may be writing into it.
+pub fn clean(folder: impl AsRef<Path>) {
+    let Ok(entries) = fs::read_dir(folder) else { return };
+    for entry in entries.flatten() {
+        let name = entry.file_name();
+        let name = name.to_string_lossy();
+        if name.starts_with('.') && name.ends_with(".tmp") {
+            // What cannot be removed costs nothing but its place on the disk.
+            let _ = fs::remove_file(entry.path());
+        }
+    }
+}
 
 /// Writes a file through `write` so that nobody ever sees half of it: into a temporary file in the same folder,
 /// flushed to the disk, then renamed over `path`. If anything fails the temporary file is removed and what stood at
@@ -14,15 +39,8 @@ pub fn write_atomically(
     path: impl AsRef<Path>,
     write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
 ) -> Result<()> {
-    static COUNTER: AtomicU64 = AtomicU64::new(0);
     let path = path.as_ref();
-    let Some(name) = path.file_name() else {
-        return Err(Error::file(path, "expected the name of a file to write"));
-    };
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
-    let number = COUNTER.fetch_add(1, Ordering::Relaxed);
-    let aside = folder.join(format!(".{}.{}-{number}.tmp", name.to_string_lossy(), std::process::id()));
+    let aside = aside(path)?;
     let result = write_whole(&aside, write).and_then(|()| fs::rename(&aside, path));
     if result.is_err() {
         // The first error is the one to report; a temporary file that cannot be removed adds nothing to it.
@@ -68,6 +86,18 @@ mod tests {
         write_bytes_atomically(&path, b"two").unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"two");
         assert_eq!(fs::read_dir(path.parent().unwrap()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn what_killed_writers_left_is_removed_and_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in [".state.safetensors.123-0.tmp", "state.safetensors", ".hidden", "notes.tmp"] {
+            fs::write(folder.path().join(name), name).unwrap();
+        }
+        clean(folder.path());
+        let mut left: Vec<_> = fs::read_dir(folder.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
+        left.sort();
+        assert_eq!(left, [".hidden", "notes.tmp", "state.safetensors"]);
     }
 
     #[test]

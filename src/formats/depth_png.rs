@@ -7,8 +7,8 @@ use image::codecs::png::PngEncoder;
 use image::{DynamicImage, ExtendedColorType, ImageEncoder};
 
 use super::atomic::write_atomically;
-use crate::data::picture::decode;
 use crate::depth::DepthMap;
+use crate::formats::picture::decode;
 use crate::{Error, Result};
 
 /// Metres in 16 bits: `round(256 * metres)`; 0 (unknown) for what is not a positive finite number. A known depth

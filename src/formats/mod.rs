@@ -6,6 +6,7 @@
 //! | [`safetensors`] | named tensors, the crate's own checkpoints |
 //! | [`pth`] | named tensors in PyTorch's pickles, read as data |
 //! | [`npz`], [`npy`] | NumPy's archives and arrays |
+//! | [`picture`] | pictures: PNG, JPEG, WebP |
 //! | [`depth_png`] | depth as KITTI stores it |
 //! | [`ply`] | coloured point clouds |
 //!
@@ -15,6 +16,8 @@ pub mod atomic;
 pub mod depth_png;
 pub mod npy;
 pub mod npz;
+pub mod picture;
+mod picture_structure;
 pub mod ply;
 pub mod pth;
 pub mod safetensors;

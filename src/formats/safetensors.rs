@@ -2,17 +2,17 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
-use std::io::Read;
+use std::io::{Read, Write};
 use std::path::Path;
 use std::sync::Arc;
 
-use safetensors::tensor::{Dtype, Metadata, TensorView, serialize};
+use safetensors::tensor::{Dtype, Metadata};
 
+use super::atomic::write_atomically;
 use super::pth::shown;
 use super::stored::{self, StoredTensor};
 use super::tensor_file::TensorFile;
 use crate::error::{Error, Result};
-use crate::nn::Params;
 use crate::tensor::{Float, Tensor};
 
 /// The largest file that is read, in bytes. The training state of the largest size has 2 GB.
@@ -20,42 +20,68 @@ const MAX_FILE: u64 = 8 << 30;
 /// The longest header, in bytes. A tensor takes some 150.
 const MAX_HEADER: u64 = 8 << 20;
 
-/// The bytes of a checkpoint: every tensor under its own name, in PyTorch's layout, in f32, and `metadata`.
-pub fn to_bytes<T: Float>(tensors: &BTreeMap<String, Tensor<T>>, metadata: HashMap<String, String>) -> Result<Vec<u8>> {
-    let bytes: Vec<(&String, Vec<usize>, Vec<u8>)> = tensors
-        .iter()
-        .map(|(name, t)| {
-            let numbers = t.data().iter().flat_map(|x| (x.f64() as f32).to_le_bytes()).collect();
-            (name, t.dims().to_vec(), numbers)
-        })
-        .collect();
-    let views: Result<Vec<_>, _> = bytes
-        .iter()
-        .map(|(name, dims, numbers)| Ok((name.as_str(), TensorView::new(Dtype::F32, dims.clone(), numbers)?)))
-        .collect();
-    let failed = |e: safetensors::SafeTensorError| Error::Failed(format!("a checkpoint could not be written: {e}"));
-    serialize(views.map_err(failed)?, Some(metadata)).map_err(failed)
+/// The metadata entry that holds the CRC-32 of all numbers, in the order of the tensors' names.
+const CHECKSUM: &str = "parallax_crc32";
+
+/// Calls `take` with the bytes of tensors in f32, a block after the other.
+fn for_each_block<'a, T: Float, E>(
+    tensors: impl Iterator<Item = &'a Tensor<T>>,
+    mut take: impl FnMut(&[u8]) -> Result<(), E>,
+) -> Result<(), E> {
+    let mut bytes = Vec::new();
+    for numbers in tensors.flat_map(|t| t.data().chunks(1 << 14)) {
+        bytes.clear();
+        bytes.extend(numbers.iter().flat_map(|x| (x.f64() as f32).to_le_bytes()));
+        take(&bytes)?;
+    }
+    Ok(())
 }
 
-/// Writes a checkpoint, aside first and then in place.
+fn checksum<'a, T: Float>(tensors: impl Iterator<Item = &'a Tensor<T>>) -> String {
+    let mut crc = crc32fast::Hasher::new();
+    let Ok(()) = for_each_block(tensors, |bytes| {
+        crc.update(bytes);
+        Ok::<(), std::convert::Infallible>(())
+    });
+    format!("{:08x}", crc.finalize())
+}
+
+/// Writes a checkpoint, aside first and then in place: every tensor under its own name, in f32, and `metadata`, to which
+/// a checksum of all numbers is added. Nothing is held in memory twice, and equal contents are equal files.
+///
+/// # Errors
+/// If the file cannot be written.
 pub fn write<T: Float>(
     path: &Path,
     tensors: &BTreeMap<String, Tensor<T>>,
     metadata: HashMap<String, String>,
 ) -> Result<()> {
-    crate::formats::atomic::write_bytes_atomically(path, &to_bytes(tensors, metadata)?)
-}
-
-/// A model's tensors under their own names, in PyTorch's layout.
-pub fn export<T: Float>(params: &Params<T>) -> BTreeMap<String, Tensor<T>> {
-    params.iter().map(|(_, p)| (p.name().to_owned(), p.layout.export(&p.value))).collect()
+    let mut about: BTreeMap<String, String> = metadata.into_iter().collect();
+    about.insert(CHECKSUM.into(), checksum(tensors.values()));
+    let mut header = serde_json::Map::from_iter([("__metadata__".to_owned(), serde_json::json!(about))]);
+    let mut end = 0;
+    for (name, tensor) in tensors {
+        let start = end;
+        end += 4 * tensor.len();
+        let entry = serde_json::json!({"dtype": "F32", "shape": tensor.dims(), "data_offsets": [start, end]});
+        header.insert(name.clone(), entry);
+    }
+    let mut header = serde_json::to_vec(&header).map_err(|e| Error::file(path, format!("its header: {e}")))?;
+    // The numbers begin at a multiple of eight bytes.
+    header.resize(header.len().next_multiple_of(8), b' ');
+    write_atomically(path, |writer| {
+        writer.write_all(&(header.len() as u64).to_le_bytes())?;
+        writer.write_all(&header)?;
+        for_each_block(tensors.values(), |bytes| writer.write_all(bytes))
+    })
 }
 
 /// Opens a safetensors file.
 ///
 /// # Errors
 /// If the header does not describe the file exactly: every tensor a range of the length that its shape needs, no two
-/// overlapping, nothing left over. Nothing larger than the header is read before that is known.
+/// overlapping, nothing left over. Nothing larger than the header is read before that is known. If the numbers are not
+/// those of the checksum that [`write`] added.
 pub fn open(path: &Path) -> Result<TensorFile> {
     let io = |e| Error::io(path, e);
     let not = |why: String| Error::file(path, format!("not a safetensors file: {why}"));
@@ -91,6 +117,13 @@ pub fn open(path: &Path) -> Result<TensorFile> {
     }
     let mut bytes = Vec::with_capacity(usize::try_from(claimed).unwrap_or(0));
     file.take(claimed).read_to_end(&mut bytes).map_err(io)?;
+    let metadata = header.metadata().clone().unwrap_or_default();
+    if let Some(said) = metadata.get(CHECKSUM)
+        && *said != format!("{:08x}", crc32fast::hash(&bytes))
+    {
+        let message = "is damaged: its numbers are not those that its checksum was made of. Copy or download it again";
+        return Err(Error::file(path, message));
+    }
     let bytes = Arc::new(bytes);
 
     let mut tensors = Vec::new();
@@ -105,7 +138,6 @@ pub fn open(path: &Path) -> Result<TensorFile> {
             .ok_or_else(|| Error::file(path, format!("is damaged: {} goes beyond its end", shown(&name))))?;
         tensors.push((name, tensor));
     }
-    let metadata = header.metadata().clone().unwrap_or_default();
     Ok(TensorFile { path: path.to_owned(), tensors, integers: Vec::new(), metadata })
 }
 

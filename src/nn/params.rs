@@ -1,6 +1,6 @@
 //! Parameters and buffers by path, with the names, shapes and layouts of the public checkpoints.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
 use super::BatchNorm;
 use super::init::{Init, Start};
@@ -136,6 +136,11 @@ impl<T: Float> Params<T> {
     /// How many numbers are learnt under names that begin with `prefix`.
     pub fn count(&self, prefix: &str) -> usize {
         self.all.iter().filter(|p| p.learnt && p.name().starts_with(prefix)).map(|p| p.value.len()).sum()
+    }
+
+    /// Every tensor under its own name, in PyTorch's layout.
+    pub fn export(&self) -> BTreeMap<String, Tensor<T>> {
+        self.all.iter().map(|p| (p.name().to_owned(), p.layout.export(&p.value))).collect()
     }
 
     /// The same model in the other element type.

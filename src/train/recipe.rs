@@ -284,6 +284,31 @@ impl RunConfig {
         }
     }
 
+    /// The recipe for a start from trained weights: the published learning rates (MonoViT, section 4.1), pictures of the
+    /// weights' own size, and nothing of what random weights need.
+    pub fn from_weights(setup: Setup, steps: u64) -> Self {
+        let Setup { preset, ablation, height, width, min_depth, max_depth } = setup;
+        let scratch = Self::new(preset, steps);
+        RunConfig {
+            ablation,
+            height,
+            width,
+            initial_disparity: None,
+            auto_mask_delay: 0.0,
+            loss: LossConfig { min_depth, max_depth, ..scratch.loss },
+            rotations: Rotations::default(),
+            optim: OptimConfig { encoder_rate: 5e-5, rate: 1e-4, pose_rate: 1e-4, ..scratch.optim },
+            ..scratch
+        }
+    }
+
+    /// The recipe for a depth encoder that starts from an image classifier: the published learning rates.
+    pub fn from_encoder(preset: Preset, steps: u64) -> Self {
+        let scratch = Self::new(preset, steps);
+        let optim = OptimConfig { encoder_rate: 5e-5, rate: 1e-4, pose_rate: 1e-4, ..scratch.optim };
+        RunConfig { optim, ..scratch }
+    }
+
     /// The networks, their pictures and the range of their depths.
     pub fn setup(&self) -> Setup {
         let RunConfig { preset, ablation, height, width, .. } = *self;

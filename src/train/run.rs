@@ -1,34 +1,34 @@
-//! A training run: its configuration, its folder, and the loop that fills it.
+//! A training run: its folder, and the loop that fills it.
 //!
-//! `RUN/config.toml` (all of it, to run it again), `log.jsonl` (a line a logged step), `checkpoints/` (the whole state),
-//! `best.safetensors`, `metrics.json`, `images/`.
+//! `RUN/config.toml` (all of it, to run it again), `log.jsonl` (a line a logged step and a validation), `checkpoints/` (the
+//! whole state, and the one before it), `best.safetensors`, `metrics.json`, `images/`.
+//!
+//! What is computed is never lost: the state is written before anything is measured, and nothing that only concerns
+//! reporting ends a training.
 
-use std::collections::HashMap;
-use std::fs;
-use std::io::Write;
+use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
+use super::log::{self, Log};
 use super::recipe::{RunConfig, read_config};
 use super::start::Start;
+use super::state::{self, Notes};
 use super::trainer::{StepReport, Trainer};
+pub use super::validation::{RunMetrics, Validation};
 use crate::data::Dataset;
-use crate::data::batch::{Augment, Batch, Loader, batch_of_step};
+use crate::data::batch::Loader;
 use crate::error::{Error, Result};
-use crate::eval::metrics::{MeanMap, Metrics, Protocol, Scale};
-use crate::eval::predictor::{Evaluation, Predictor, evaluate, evaluate_mean_map};
-use crate::formats::atomic::{check_writable, write_bytes_atomically};
+use crate::formats::atomic::{self, check_writable, write_bytes_atomically};
 use crate::formats::safetensors;
 use crate::monovit::{MonoVit, Setup};
 use crate::nn::Params;
-use crate::report::colormap::disparity_to_image;
-use crate::weights;
-use crate::weights::{Need, Weights};
+use crate::weights::{self, Need, Weights};
 
-/// What a run trains, validates and reports on. No sample is in two of them.
+/// The samples that a run trains on, validates on and reports on. None is in two of them.
 pub struct RunData {
     /// Trained on.
     pub train: Arc<dyn Dataset>,
@@ -38,28 +38,9 @@ pub struct RunData {
     pub test: Option<Arc<dyn Dataset>>,
 }
 
-/// `metrics.json`.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct RunMetrics {
-    /// The weights as they start.
-    pub before: Metrics,
-    /// The best weights.
-    pub after: Metrics,
-    /// The mean depth map of the training data, where its depth is known.
-    pub mean_map: Option<Metrics>,
-    /// The time of the training loop, in seconds.
-    pub seconds: f64,
-    /// Its steps.
-    pub steps: u64,
-    /// How many images were compared.
-    pub images: usize,
-    /// What was compared, in words.
-    pub test: String,
-}
-
 /// A logged step.
 #[derive(Clone, Debug, Serialize)]
-struct LogLine {
+struct StepLine {
     #[serde(flatten)]
     step: StepReport,
     /// Of one step, the mean since the last line.
@@ -68,7 +49,7 @@ struct LogLine {
     data_seconds: f64,
 }
 
-/// What the loop tells whoever watches.
+/// The things that whoever watches is told.
 pub enum Event<'a> {
     /// A phase begins, in words.
     Phase(&'a str),
@@ -77,26 +58,16 @@ pub enum Event<'a> {
     /// A step is done.
     Step(&'a StepReport),
     /// Weights were validated.
-    Validated(&'a Validated),
-}
-
-/// What validation found.
-pub struct Validated {
-    /// After this step.
-    pub step: u64,
-    /// The photometric error, which the best weights are chosen by.
-    pub photometric: f64,
-    /// Whether it is the lowest so far.
-    pub best: bool,
-    /// Abs Rel with median scaling, where there is ground truth: to be seen, not to choose by.
-    pub abs_rel: Option<f64>,
+    Validated(&'a Validation),
+    /// Something could not be measured, and why; training goes on.
+    Warning(&'a str),
 }
 
 /// How a run ended.
 pub enum Ended {
     /// All steps are done.
-    Finished(Option<Box<RunMetrics>>),
-    /// Someone asked it to stop; it can be resumed.
+    Finished(Box<RunMetrics>),
+    /// Someone asked it to stop after this step; it can be resumed.
     Interrupted(u64),
 }
 
@@ -104,34 +75,27 @@ pub enum Ended {
 pub struct Run {
     /// The folder.
     pub folder: PathBuf,
-    /// What it runs.
+    /// The recipe.
     pub config: RunConfig,
-    trainer: Trainer,
-    /// The photometric error of the best weights so far; none before the first validation.
-    best: Option<f64>,
-    /// Seconds of training before this process.
-    seconds: f64,
-    before: Option<Metrics>,
-}
-
-/// What a state file says beside the tensors.
-#[derive(Serialize, Deserialize)]
-struct StateNotes {
-    best: Option<f64>,
-    seconds: f64,
-    before: Option<Metrics>,
+    pub(super) trainer: Trainer,
+    pub(super) notes: Notes,
+    /// Held while this process has the run.
+    _lock: File,
 }
 
 impl Run {
     /// Makes sure that a run can be written into this folder, which is made if it is missing: to be called before
-    /// anything that takes time.
+    /// anything that takes time. A run that was killed before its first state is no obstacle.
     ///
     /// # Errors
-    /// If the folder holds something, or cannot be written into.
+    /// If the folder holds something else, or cannot be written into.
     pub fn claim(folder: &Path) -> Result<()> {
         fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
-        let mut entries = fs::read_dir(folder).map_err(|e| Error::io(folder, e))?;
-        if entries.next().is_some() {
+        atomic::clean(folder);
+        let entries = fs::read_dir(folder).map_err(|e| Error::io(folder, e))?;
+        let begun = ["config.toml", "log.jsonl", LOCK];
+        let names: Vec<_> = entries.flatten().map(|e| e.file_name()).collect();
+        if names.iter().any(|name| begun.iter().all(|b| name != b)) {
             let message = "is not empty: give another folder with --out, or go on with --resume";
             return Err(Error::file(folder, message));
         }
@@ -149,51 +113,49 @@ impl Run {
     pub fn create_from(folder: &Path, mut config: RunConfig, start: Start) -> Result<Self> {
         config.check()?;
         Self::claim(folder)?;
+        let lock = lock(folder)?;
         if start.knows_motion {
             // Pose networks that somebody trained know rotations already.
-            config.rotations.share = 0.0;
-            config.rotations.keep = 0.0;
+            (config.rotations.share, config.rotations.keep) = (0.0, 0.0);
         }
-        let text = toml::to_string(&config).map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
-        write_bytes_atomically(folder.join("config.toml"), text.as_bytes())?;
+        write_config(folder, &config)?;
         let trainer = Trainer::of(start.model, start.params, config.plan());
-        let run = Self::of(folder, config, trainer);
+        let run = Run { folder: folder.to_owned(), config, trainer, notes: Notes::default(), _lock: lock };
         run.save()?;
         Ok(run)
     }
 
     /// A run that was interrupted, where it stood.
+    ///
+    /// # Errors
+    /// As [`resume_with`](Run::resume_with).
     pub fn resume(folder: &Path) -> Result<Self> {
-        let path = folder.join("config.toml");
-        let config = read_config(&path)?;
-        config.check().map_err(|e| Error::file(&path, e.to_string()))?;
-        let trainer = Trainer::new(config.model(), config.plan());
-        let mut run = Self::of(folder, config, trainer);
-        let state = run.state_file();
-        run.trainer.load(&state)?;
-        let notes = safetensors::read::<f32>(&state)?.metadata.remove("run").unwrap_or_default();
-        let notes: StateNotes =
-            serde_json::from_str(&notes).map_err(|e| Error::file(&state, format!("its notes on the run: {e}")))?;
-        (run.best, run.seconds, run.before) = (notes.best, notes.seconds, notes.before);
-        // Lines that were logged after the state was written will be logged again.
-        let log = folder.join("log.jsonl");
-        if let Ok(text) = fs::read_to_string(&log) {
-            let done = run.trainer.steps();
-            let step =
-                |line: &&str| serde_json::from_str::<serde_json::Value>(line).ok().and_then(|v| v["step"].as_u64());
-            let kept: String =
-                text.lines().filter(|l| step(l).is_some_and(|s| s <= done)).flat_map(|l| [l, "\n"]).collect();
-            write_bytes_atomically(&log, kept.as_bytes())?;
+        Self::resume_with(folder, |_| Ok(()), |_| ())
+    }
+
+    /// A run that was interrupted or finished, where it stood, with another recipe: more steps, data elsewhere. `change`
+    /// gets the recipe; `tell` hears of a damaged state that was passed over for the one before it.
+    ///
+    /// # Errors
+    /// If the folder holds no run, another process has it, or no state can be read.
+    pub fn resume_with(
+        folder: &Path,
+        change: impl FnOnce(&mut RunConfig) -> Result<()>,
+        mut tell: impl FnMut(&str),
+    ) -> Result<Self> {
+        let mut config = read_config(&folder.join("config.toml"))?;
+        let before = config.clone();
+        change(&mut config)?;
+        config.check()?;
+        let lock = lock(folder)?;
+        atomic::clean(folder.join(CHECKPOINTS));
+        let mut trainer = Trainer::new(config.model(), config.plan());
+        let notes = state::load(&mut trainer, folder, &mut tell)?;
+        if config != before {
+            write_config(folder, &config)?;
         }
-        Ok(run)
-    }
-
-    fn of(folder: &Path, config: RunConfig, trainer: Trainer) -> Self {
-        Run { folder: folder.to_owned(), config, trainer, best: None, seconds: 0.0, before: None }
-    }
-
-    fn state_file(&self) -> PathBuf {
-        self.folder.join("checkpoints/state.safetensors")
+        log::forget_after(folder, trainer.steps(), notes.validated)?;
+        Ok(Run { folder: folder.to_owned(), config, trainer, notes, _lock: lock })
     }
 
     /// Steps done.
@@ -202,196 +164,146 @@ impl Run {
     }
 
     /// Trains to the end, or until `stop` says so.
+    ///
+    /// # Errors
+    /// If a step fails (numbers that are not finite, a frame that cannot be read) or the state cannot be written. The
+    /// state before the failing step is kept.
     pub fn train(&mut self, data: &RunData, stop: impl Fn() -> bool, mut tell: impl FnMut(Event)) -> Result<Ended> {
-        let test: Option<(&dyn Dataset, Vec<usize>)> =
-            data.test.as_deref().map(|t| (t, (0..t.len()).collect::<Vec<_>>()));
-        if let (Some((test, samples)), None) = (&test, self.before) {
-            tell(Event::Phase("measuring the untrained network"));
-            let predictor = Predictor::new(&self.trainer.model, &self.trainer.params, &self.config.setup());
-            self.before = Some(evaluate(&predictor, *test, samples, DENSE, |_| ())?.metrics);
+        let mean_map = self.measure_beforehand(data, &mut tell);
+        let validation = self.validation_batches(data, &mut tell);
+        let mut log = Log::open(&self.folder)?;
+        if !self.learn_rotations(data, &stop, &mut tell)? {
+            // The state on disk is that before the first of these steps: they will be taken again.
+            return Ok(Ended::Interrupted(0));
         }
-        // Before training, so that ground truth that cannot be read costs no run.
-        let mean_map = match &test {
-            Some((test, samples)) => mean_map(data.train.as_ref(), *test, samples)?,
-            None => None,
-        };
-        let validation = self.validation_batches(data)?;
+        if self.validation_is_due() {
+            self.validate(data, &validation, &mut log, &mut tell)?;
+        }
         let (augment, batch, seed) = (self.config.augment, self.config.batch, self.config.seed);
         let mut loader = Loader::start(data.train.clone(), augment, batch, seed, self.trainer.steps())?;
-        let log_path = self.folder.join("log.jsonl");
-        let log = fs::OpenOptions::new().create(true).append(true).open(&log_path);
-        let mut log = log.map_err(|e| Error::io(&log_path, e))?;
-
-        if self.trainer.steps() == 0 && self.config.plan().rotations.steps > 0 {
-            tell(Event::Phase("teaching the pose network what a rotation looks like"));
-            let started = Instant::now();
-            // The same frames as in training, in another order.
-            let mut loader = Loader::start(data.train.clone(), augment, batch, seed ^ u64::MAX, 0)?;
-            let learnt = self.trainer.learn_rotations(
-                || loader.next_batch(),
-                |step, error| {
-                    tell(Event::Rotations(step, error));
-                    !stop()
-                },
-            )?;
-            if !learnt {
-                // The state on disk is that before the first of these steps: they will be taken again.
-                return Ok(Ended::Interrupted(0));
-            }
-            self.seconds += started.elapsed().as_secs_f64();
-        }
         tell(Event::Phase("training"));
         let (mut since, mut waited, mut counted) = (Instant::now(), 0.0, 0u32);
         while self.trainer.steps() < self.config.steps {
             let asked = Instant::now();
-            let batch = loader.next_batch()?;
-            waited += asked.elapsed().as_secs_f64();
-            let report = self.trainer.step(&batch)?;
+            let next = loader.next_batch();
+            let report = match next.and_then(|batch| {
+                waited += asked.elapsed().as_secs_f64();
+                self.trainer.step(&batch)
+            }) {
+                Ok(report) => report,
+                Err(error) => {
+                    // All steps before this one are worth keeping, unless their weights are what failed.
+                    if self.trainer.steps() > 0 && self.trainer.check_finite().is_ok() {
+                        self.save()?;
+                    }
+                    return Err(error);
+                }
+            };
             counted += 1;
             let last = report.step == self.config.steps;
             if report.step.is_multiple_of(self.config.log_every) || last || report.step == 1 {
                 let n = f64::from(counted);
-                let line =
-                    LogLine { step: report, seconds: since.elapsed().as_secs_f64() / n, data_seconds: waited / n };
-                let text = serde_json::to_string(&line).map_err(|e| Error::Failed(format!("the log: {e}")))?;
-                writeln!(log, "{text}").map_err(|e| Error::io(&log_path, e))?;
-                self.seconds += since.elapsed().as_secs_f64();
+                let (seconds, data_seconds) = (since.elapsed().as_secs_f64() / n, waited / n);
+                log.write(&StepLine { step: report, seconds, data_seconds })?;
+                self.notes.seconds += since.elapsed().as_secs_f64();
                 (since, waited, counted) = (Instant::now(), 0.0, 0);
             }
             tell(Event::Step(&report));
             let stopping = stop() && !last;
-            if report.step.is_multiple_of(self.config.checkpoint_every) || last || stopping {
-                self.seconds += since.elapsed().as_secs_f64();
-                if !stopping {
-                    self.keep_if_best(data, &validation, report.step, &mut tell)?;
-                }
+            if self.checkpoint_is_due() || stopping {
+                self.notes.seconds += since.elapsed().as_secs_f64();
                 self.save()?;
+                if stopping {
+                    self.leave_weights()?;
+                    return Ok(Ended::Interrupted(report.step));
+                }
+                self.validate(data, &validation, &mut log, &mut tell)?;
                 since = Instant::now();
-            }
-            if stopping {
-                return Ok(Ended::Interrupted(report.step));
             }
         }
         drop(loader);
-        Ok(Ended::Finished(self.finish(data, test, mean_map, &mut tell)?.map(Box::new)))
+        Ok(Ended::Finished(Box::new(self.finish(data, mean_map, &mut tell)?)))
     }
 
-    /// A fixed set of batches without augmentation.
-    fn validation_batches(&self, data: &RunData) -> Result<Vec<Batch>> {
-        let plain = Augment { flip: false, jitter: false };
-        let size = self.config.batch.min(data.validation.len());
-        let count = (data.validation.len() / size.max(1)).min(10) as u64;
-        (0..count).map(|step| batch_of_step(data.validation.as_ref(), plain, size, 0, step)).collect()
+    /// Whether the state is written after the step that was taken last.
+    fn checkpoint_is_due(&self) -> bool {
+        let steps = self.trainer.steps();
+        steps.is_multiple_of(self.config.checkpoint_every) || steps == self.config.steps
     }
 
-    fn keep_if_best(
+    /// Whether a checkpoint's weights have not been validated: the run stopped in between.
+    fn validation_is_due(&self) -> bool {
+        self.trainer.steps() > 0 && self.checkpoint_is_due() && self.notes.validated < self.trainer.steps()
+    }
+
+    /// Teaches the pose networks rotations, if the recipe says so and nothing is learnt yet; whether it came to the end.
+    fn learn_rotations(
         &mut self,
         data: &RunData,
-        batches: &[Batch],
-        step: u64,
+        stop: &impl Fn() -> bool,
         tell: &mut impl FnMut(Event),
-    ) -> Result<()> {
+    ) -> Result<bool> {
+        if self.trainer.steps() > 0 || self.config.plan().rotations.steps == 0 {
+            return Ok(true);
+        }
+        tell(Event::Phase("teaching the pose network what a rotation looks like"));
+        let started = Instant::now();
+        let (augment, batch, seed) = (self.config.augment, self.config.batch, self.config.seed);
+        // The same frames as in training, in another order.
+        let mut loader = Loader::start(data.train.clone(), augment, batch, seed ^ u64::MAX, 0)?;
+        let learnt = self.trainer.learn_rotations(
+            || loader.next_batch(),
+            |step, error| {
+                tell(Event::Rotations(step, error));
+                !stop()
+            },
+        )?;
+        self.notes.seconds += started.elapsed().as_secs_f64();
+        Ok(learnt)
+    }
+
+    /// Writes the state; what it holds is checked first.
+    pub(super) fn save(&self) -> Result<()> {
+        state::save(&self.trainer, &self.folder, &self.notes)
+    }
+
+    /// Leaves weights to predict with where no validation has chosen any yet.
+    fn leave_weights(&self) -> Result<()> {
+        if self.notes.best.is_some() {
+            return Ok(());
+        }
         let weights = self.trainer.weights();
-        let photometric = self.trainer.validate(&weights, batches);
-        let best = self.best.is_none_or(|b| photometric < b);
-        if best {
-            self.best = Some(photometric);
-            write_weights(&self.folder.join("best.safetensors"), &weights, &self.config.setup())?;
-        }
-        let samples = forty_of(data.validation.len());
-        let predictor = Predictor::new(&self.trainer.model, &weights, &self.config.setup());
-        let abs_rel = match data.validation.depth(0)? {
-            Some(_) => Some(evaluate(&predictor, data.validation.as_ref(), &samples, DENSE, |_| ())?.metrics.abs_rel),
-            None => None,
-        };
-        tell(Event::Validated(&Validated { step, photometric, best, abs_rel }));
-        Ok(())
-    }
-
-    fn save(&self) -> Result<()> {
-        let notes = StateNotes { best: self.best, seconds: self.seconds, before: self.before };
-        let notes = serde_json::to_string(&notes).map_err(|e| Error::Failed(format!("the state: {e}")))?;
-        self.trainer.save(&self.state_file(), HashMap::from([("run".into(), notes)]))
-    }
-
-    fn finish(
-        &self,
-        data: &RunData,
-        test: Option<(&dyn Dataset, Vec<usize>)>,
-        mean_map: Option<Metrics>,
-        tell: &mut impl FnMut(Event),
-    ) -> Result<Option<RunMetrics>> {
-        tell(Event::Phase("measuring the best weights"));
-        let (model, params, _) = load_weights(&self.folder.join("best.safetensors"))?;
-        let predictor = Predictor::new(&model, &params, &self.config.setup());
-        let shown: &dyn Dataset = test.as_ref().map_or(data.validation.as_ref(), |(t, _)| *t);
-        self.write_images(&predictor, shown)?;
-        let Some((test, samples)) = test else { return Ok(None) };
-        let after = evaluate(&predictor, test, &samples, DENSE, |_| ())?;
-        let metrics = RunMetrics {
-            before: self.before.unwrap_or_default(),
-            after: after.metrics,
-            mean_map,
-            seconds: self.seconds,
-            steps: self.trainer.steps(),
-            images: after.images,
-            test: format!("{} and {} more", test.name(0), samples.len() - 1),
-        };
-        let text = serde_json::to_string_pretty(&metrics).map_err(|e| Error::Failed(format!("the metrics: {e}")))?;
-        write_bytes_atomically(self.folder.join("metrics.json"), text.as_bytes())?;
-        Ok(Some(metrics))
-    }
-
-    /// A few pictures with their predicted disparity (and the true one, where it is known) below.
-    fn write_images(&self, predictor: &Predictor, data: &dyn Dataset) -> Result<()> {
-        let count = data.len().min(8);
-        for i in 0..count {
-            let sample = i * data.len() / count;
-            let image = data.image(sample, 0)?;
-            let (w, h) = image.dimensions();
-            let mut rows =
-                vec![image.as_ref().clone(), disparity_to_image(&predictor.disparity(&image), w as usize, h as usize)];
-            if let Some(truth) = data.depth(sample)?
-                && (truth.width, truth.height) == (w as usize, h as usize)
-            {
-                let inverse: Vec<f32> = truth.metres.iter().map(|&m| if m > 0.0 { 1.0 / m } else { 0.0 }).collect();
-                rows.push(disparity_to_image(&inverse, truth.width, truth.height));
-            }
-            let mut sheet = image::RgbImage::new(w, h * rows.len() as u32);
-            for (r, row) in rows.iter().enumerate() {
-                image::imageops::replace(&mut sheet, row, 0, i64::from(h) * r as i64);
-            }
-            let path = self.folder.join(format!("images/{i:02}.png"));
-            let mut bytes = std::io::Cursor::new(Vec::new());
-            sheet
-                .write_to(&mut bytes, image::ImageFormat::Png)
-                .map_err(|e| Error::file(&path, format!("could not be encoded: {e}")))?;
-            write_bytes_atomically(&path, bytes.get_ref())?;
-        }
-        Ok(())
+        write_weights(&self.folder.join(BEST), &weights, &self.config.setup())
     }
 }
 
-/// What the mean depth map of the training data is worth; nothing, if its depth is not known.
-fn mean_map(train: &dyn Dataset, test: &dyn Dataset, samples: &[usize]) -> Result<Option<Metrics>> {
-    if train.depth(0)?.is_none() {
-        return Ok(None);
+/// The file of the weights that validation chose.
+pub(super) const BEST: &str = "best.safetensors";
+/// The folder of states.
+pub(super) const CHECKPOINTS: &str = "checkpoints";
+const LOCK: &str = ".lock";
+
+/// Takes the run for this process, until the file is closed, be it by a crash.
+fn lock(folder: &Path) -> Result<File> {
+    let path = folder.join(LOCK);
+    let file = File::create(&path).map_err(|e| Error::io(&path, e))?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => {
+            Err(Error::file(folder, "another process is training this run: wait for it, or give another folder"))
+        }
+        Err(TryLockError::Error(e)) => Err(Error::io(&path, e)),
     }
-    let map = MeanMap::of_dataset(train)?;
-    Ok(Some(evaluate_mean_map(&map, test, samples, DENSE)?.metrics))
 }
 
-/// How a run measures depth: every pixel with ground truth, at the truth's median.
-const DENSE: Evaluation = Evaluation { protocol: Protocol::Dense, scale: Scale::Median, flip: false };
-
-/// At most forty samples, evenly over all.
-fn forty_of(len: usize) -> Vec<usize> {
-    (0..len).step_by(len.div_ceil(40).max(1)).collect()
+fn write_config(folder: &Path, config: &RunConfig) -> Result<()> {
+    let text = toml::to_string(config).map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
+    write_bytes_atomically(folder.join("config.toml"), text.as_bytes())
 }
 
 /// Writes weights for use: PyTorch's names and layouts, their setup in the metadata.
 pub fn write_weights(path: &Path, params: &Params<f32>, setup: &Setup) -> Result<()> {
-    safetensors::write(path, &safetensors::export(params), setup.metadata()?)
+    safetensors::write(path, &params.export(), setup.metadata()?)
 }
 
 /// Reads weights to predict depth with: a run's folder, or a file or folder of any kind that [`weights::load`] reads.

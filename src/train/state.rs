@@ -1,14 +1,132 @@
-//! The whole state of a training, to go on from: weights, moments, averages, steps.
+//! The whole state of a training, to go on from: weights, moments, averages, steps, and notes on the run.
+//!
+//! `checkpoints/state.safetensors` is replaced only when the next one is whole on the disk, and stays as
+//! `previous.safetensors`: if one is damaged, the other is taken.
 
 use std::collections::{BTreeMap, HashMap};
+use std::fs;
 use std::path::Path;
 
+use serde::{Deserialize, Serialize};
+
+use super::run::CHECKPOINTS;
 use super::trainer::Trainer;
 use crate::error::{Error, Result};
+use crate::eval::metrics::Metrics;
+use crate::formats::atomic::write_bytes_atomically;
 use crate::formats::safetensors;
 use crate::tensor::Tensor;
 
+/// What is known of a run beside its tensors.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct Notes {
+    /// The photometric error of the best weights so far; none before the first validation.
+    pub(super) best: Option<f64>,
+    /// Seconds of training.
+    pub(super) seconds: f64,
+    /// The starting weights on test data.
+    pub(super) before: Option<Metrics>,
+    /// The last step whose weights were validated.
+    #[serde(default)]
+    pub(super) validated: u64,
+}
+
+/// [`Notes`] with the step of the state that they belong to.
+#[derive(Serialize, Deserialize)]
+struct Dated {
+    step: u64,
+    notes: Notes,
+}
+
+impl Notes {
+    /// Writes them beside the state of a step, which need not be written again for them.
+    pub(super) fn write(&self, folder: &Path, step: u64) -> Result<()> {
+        let dated = Dated { step, notes: self.clone() };
+        let text = serde_json::to_string(&dated).map_err(|e| Error::Failed(format!("the notes: {e}")))?;
+        write_bytes_atomically(folder.join(CHECKPOINTS).join(NOTES), text.as_bytes())
+    }
+}
+
+const STATE: &str = "state.safetensors";
+const PREVIOUS: &str = "previous.safetensors";
+const NEXT: &str = "next.safetensors";
+const NOTES: &str = "notes.json";
+
+/// Writes the state of a run.
+///
+/// # Errors
+/// If a number in it is not finite: the parameter is named, and the state on disk stays. If it cannot be written.
+pub(super) fn save(trainer: &Trainer, folder: &Path, notes: &Notes) -> Result<()> {
+    trainer.check_finite()?;
+    let folder = folder.join(CHECKPOINTS);
+    let notes = serde_json::to_string(notes).map_err(|e| Error::Failed(format!("the state: {e}")))?;
+    let [state, next, previous] = [STATE, NEXT, PREVIOUS].map(|name| folder.join(name));
+    trainer.save(&next, HashMap::from([("run".into(), notes)]))?;
+    if state.exists() {
+        fs::rename(&state, &previous).map_err(|e| Error::io(&previous, e))?;
+    }
+    fs::rename(&next, &state).map_err(|e| Error::io(&state, e))
+}
+
+/// Reads the newest state of a run that is whole into a trainer; `tell` hears of those that are not.
+///
+/// # Errors
+/// If there is none: what is wrong with the newest.
+pub(super) fn load(trainer: &mut Trainer, folder: &Path, tell: &mut impl FnMut(&str)) -> Result<Notes> {
+    let folder = folder.join(CHECKPOINTS);
+    let mut first = None;
+    // A run that was killed between two renames has its newest state under the name of the next.
+    for name in [STATE, NEXT, PREVIOUS] {
+        let path = folder.join(name);
+        if name != STATE && !path.exists() {
+            continue;
+        }
+        match read(trainer, &path) {
+            Ok(mut notes) => {
+                if let Some(error) = first {
+                    tell(&format!("{error}; going on from {} at step {}", path.display(), trainer.steps()));
+                }
+                let beside = fs::read_to_string(folder.join(NOTES)).ok();
+                let dated = beside.and_then(|text| serde_json::from_str::<Dated>(&text).ok());
+                if let Some(dated) = dated.filter(|d| d.step == trainer.steps()) {
+                    notes = dated.notes;
+                }
+                return Ok(notes);
+            }
+            Err(error) => first = first.or(Some(error)),
+        }
+    }
+    Err(first.unwrap_or_else(|| Error::file(&folder, "holds no state of a training")))
+}
+
+fn read(trainer: &mut Trainer, path: &Path) -> Result<Notes> {
+    let mut metadata = trainer.load(path)?;
+    let notes = metadata.remove("run").unwrap_or_default();
+    serde_json::from_str(&notes).map_err(|e| Error::file(path, format!("its notes on the run: {e}")))
+}
+
 impl Trainer {
+    /// Checks that weights, moments and averages are finite.
+    ///
+    /// # Errors
+    /// Names the step and the parameter.
+    pub fn check_finite(&self) -> Result<()> {
+        for (id, p) in self.params.iter() {
+            let moments = self.adamw.moments[id.0].iter().flatten();
+            let average = self.average.iter().map(|a| &a.values[id.0]);
+            if let Some(which) = std::iter::once(&p.value).chain(average).chain(moments).position(|t| !t.is_finite()) {
+                let what = if which == 0 { "" } else { "what the optimiser keeps of " };
+                let message = format!(
+                    "step {}: {what}{} is not finite after the step: is a learning rate too high? The last good state is kept",
+                    self.adamw.steps,
+                    p.name()
+                );
+                return Err(Error::Failed(message));
+            }
+        }
+        Ok(())
+    }
+
     /// Writes the whole state: weights, moments, average, step.
     pub fn save(&self, path: &Path, metadata: HashMap<String, String>) -> Result<()> {
         let mut tensors: BTreeMap<String, Tensor<f32>> = BTreeMap::new();
@@ -27,8 +145,9 @@ impl Trainer {
         safetensors::write(path, &tensors, metadata)
     }
 
-    /// Goes on from a state written by [`save`](Trainer::save).
-    pub fn load(&mut self, path: &Path) -> Result<()> {
+    /// Goes on from a state written by [`save`](Trainer::save); returns the file's metadata. If anything is wrong nothing
+    /// is changed but what the next state overwrites.
+    pub fn load(&mut self, path: &Path) -> Result<HashMap<String, String>> {
         let mut contents = safetensors::read::<f32>(path)?;
         let broken = |what: &str| Error::file(path, format!("{what}: not a training state of this configuration"));
         let steps = contents.metadata.get("steps").and_then(|s| s.parse().ok());
@@ -48,6 +167,6 @@ impl Trainer {
                 average.values[id.0] = take("average")?.ok_or_else(|| broken("the averaged weights are missing"))?;
             }
         }
-        Ok(())
+        Ok(contents.metadata)
     }
 }

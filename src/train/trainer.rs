@@ -205,16 +205,19 @@ impl Trainer {
         })
     }
 
-    /// The mean photometric error of batches, with the given weights in evaluation mode: what validation selects by.
-    pub fn validate(&self, params: &Params<f32>, batches: &[Batch]) -> f64 {
+    /// The mean photometric errors of batches with the given weights in evaluation mode: the minimum that validation
+    /// selects by, that of warped neighbours alone, and that of unwarped ones.
+    pub fn validate(&self, params: &Params<f32>, batches: &[Batch]) -> [f64; 3] {
         let c = Context::inference(params);
         let errors = batches.iter().map(|batch| {
             let [prev, target, next] = batch.seen.each_ref().map(|t| Var::constant(t.clone()));
             let disparities = self.model.disparities(&c, &target);
             let transforms = self.model.transforms(&c, &prev, &target, &next);
-            loss(&disparities[..1], &transforms, &views(batch, Scales::Full), &self.plan.loss, None).photometric
+            let found = loss(&disparities[..1], &transforms, &views(batch, Scales::Full), &self.plan.loss, None);
+            [found.photometric, found.warped, found.unwarped]
         });
-        let errors: Vec<f64> = errors.collect();
-        errors.iter().sum::<f64>() / errors.len().max(1) as f64
+        let mut sums = [0.0; 3];
+        errors.for_each(|error| sums.iter_mut().zip(error).for_each(|(s, e)| *s += e));
+        sums.map(|s| s / batches.len().max(1) as f64)
     }
 }

@@ -61,6 +61,14 @@ pub fn load(paths: &[PathBuf], need: Need, allow_partial: bool) -> Result<Weight
     Ok(Weights { model, params, setup, report })
 }
 
+/// The setup that some files of weights, of all four networks, say or have by their size.
+///
+/// # Errors
+/// As [`Sources::open`] and [`Sources::setup`].
+pub fn setup_of(paths: &[PathBuf]) -> Result<Setup> {
+    Sources::open(paths)?.setup(Need::All)
+}
+
 /// The size of the network that some files are weights of.
 ///
 /// # Errors

@@ -73,6 +73,11 @@ impl Outputs {
         }
     }
 
+    /// Whether all of them are there.
+    pub fn exist(&self) -> bool {
+        self.named().all(|(_, path)| path.is_file())
+    }
+
     fn named(&self) -> impl Iterator<Item = (&'static str, &Path)> {
         let all = [
             ("disparity", Some(&self.disparity)),

@@ -26,10 +26,10 @@ pub use lidar::{DepthAxis, project_scan, read_scan};
 pub use split::{Side, SplitLine, read_split};
 
 use super::Dataset;
-use super::picture::{check_picture, read_picture};
 use super::resize::lanczos;
 use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
+use crate::formats::picture::{check_picture, read_picture};
 use crate::{Error, Result};
 
 /// Whose intrinsics the samples carry.

@@ -1,13 +1,17 @@
 //! Pictures from files (PNG, JPEG, WebP): headers checked before anything is decoded, sizes bounded, turned as their
 //! EXIF orientation says, messages with the path.
 
+use std::cell::Cell;
 use std::fs::File;
 use std::io::{Cursor, Read};
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
+use std::sync::Once;
 
 use image::metadata::Orientation;
-use image::{DynamicImage, ImageDecoder, ImageError, ImageReader, RgbImage};
+use image::{DynamicImage, ImageDecoder, ImageError, ImageReader, Limits, RgbImage};
 
+use super::picture_structure as structure;
 use crate::{Error, Result};
 
 /// Pictures with more pixels are refused.
@@ -48,8 +52,42 @@ fn open(path: &Path) -> Result<File> {
     Ok(file)
 }
 
-fn dimensions(bytes: &[u8]) -> Result<(u32, u32), ImageError> {
-    ImageReader::new(Cursor::new(bytes)).with_guessed_format()?.into_dimensions()
+fn dimensions(bytes: &[u8]) -> Result<(u32, u32), Undecodable> {
+    fenced(|| ImageReader::new(Cursor::new(bytes)).with_guessed_format()?.into_dimensions())
+}
+
+/// Why a decoder gave up.
+enum Undecodable {
+    /// It says why.
+    Said(ImageError),
+    /// It met something that its authors did not think of.
+    Panicked,
+}
+
+thread_local! {
+    /// Whether panics of this thread are somebody else's: caught, and reported as errors.
+    static FENCED: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Runs a decoder, whose panics become errors and print nothing.
+fn fenced<T>(decode: impl FnOnce() -> Result<T, ImageError>) -> Result<T, Undecodable> {
+    static HOOK: Once = Once::new();
+    HOOK.call_once(|| {
+        let usual = std::panic::take_hook();
+        std::panic::set_hook(Box::new(move |info| {
+            if !FENCED.get() {
+                usual(info);
+            }
+        }));
+    });
+    FENCED.set(true);
+    // What a decoder leaves half done is dropped with it.
+    let result = catch_unwind(AssertUnwindSafe(decode));
+    FENCED.set(false);
+    match result {
+        Ok(result) => result.map_err(Undecodable::Said),
+        Err(_) => Err(Undecodable::Panicked),
+    }
 }
 
 fn check_size(path: &Path, (width, height): (u32, u32)) -> Result<(u32, u32)> {
@@ -63,8 +101,12 @@ fn check_size(path: &Path, (width, height): (u32, u32)) -> Result<(u32, u32)> {
     Ok((width, height))
 }
 
-fn undecodable(path: &Path, error: &ImageError) -> Error {
-    let message = format!("expected a PNG, JPEG or WebP picture, could not decode it ({error}); convert or restore it");
+fn undecodable(path: &Path, error: &Undecodable) -> Error {
+    let why = match error {
+        Undecodable::Said(error) => error.to_string(),
+        Undecodable::Panicked => "the decoder failed on what is in it".to_owned(),
+    };
+    let message = format!("expected a PNG, JPEG or WebP picture, could not decode it ({why}); convert or restore it");
     Error::file(path, message)
 }
 
@@ -72,19 +114,28 @@ fn undecodable(path: &Path, error: &ImageError) -> Error {
 /// EXIF orientation says. Of an animation the first frame.
 ///
 /// # Errors
-/// As [`check_picture`], or if the pixels cannot be decoded.
+/// As [`check_picture`], if the file ends early, or if the pixels cannot be decoded.
 pub fn decode(path: &Path) -> Result<DynamicImage> {
     let mut bytes = Vec::new();
     open(path)?.take(MAX_BYTES).read_to_end(&mut bytes).map_err(|e| Error::io(path, e))?;
     let size = dimensions(&bytes).map_err(|e| undecodable(path, &e))?;
-    check_size(path, size)?;
-    let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format().map_err(|e| Error::io(path, e))?;
-    let mut decoder = reader.into_decoder().map_err(|e| undecodable(path, &e))?;
-    // Metadata that cannot be read is no reason to refuse a picture.
-    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-    let mut picture = DynamicImage::from_decoder(decoder).map_err(|e| undecodable(path, &e))?;
-    picture.apply_orientation(orientation);
-    Ok(picture)
+    let (width, height) = check_size(path, size)?;
+    structure::check(&bytes).map_err(|fault| Error::file(path, fault))?;
+    fenced(|| {
+        let mut reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format()?;
+        // Pixels have at most eight bytes; what lies beside them (colour profiles, texts) gets no more than that again.
+        let mut limits = Limits::default();
+        limits.max_alloc = Some(16 * u64::from(width) * u64::from(height) + (32 << 20));
+        reader.limits(limits);
+        let mut decoder = reader.into_decoder()?;
+        // Metadata that cannot be read is no reason to refuse a picture.
+        let exif = decoder.exif_metadata().ok().flatten();
+        let orientation = exif.and_then(|exif| structure::orientation(&exif)).and_then(Orientation::from_exif);
+        let mut picture = DynamicImage::from_decoder(decoder)?;
+        picture.apply_orientation(orientation.unwrap_or(Orientation::NoTransforms));
+        Ok(picture)
+    })
+    .map_err(|e| undecodable(path, &e))
 }
 
 /// [`decode`] as 8-bit RGB: grey in all three channels, 16 bits rounded to 8, alpha left out, CMYK as its inks look.
@@ -126,7 +177,7 @@ mod tests {
         fs::write(&path, png_header(1242, 375)).unwrap();
         assert_eq!(check_picture(&path).unwrap(), (1242, 375));
         let error = read_picture(&path).unwrap_err().to_string();
-        assert!(error.contains("a.png") && error.contains("could not decode"), "{error}");
+        assert!(error.contains("a.png") && error.contains("cut short"), "{error}");
     }
 
     #[test]
@@ -164,6 +215,25 @@ mod tests {
         let path = folder.path().join("g.png");
         image::GrayImage::from_pixel(4, 4, image::Luma([77])).save(&path).unwrap();
         assert_eq!(read_picture(&path).unwrap().get_pixel(1, 1).0, [77, 77, 77]);
+    }
+
+    #[test]
+    fn a_decoder_that_panics_is_an_error_and_prints_nothing() {
+        let found = fenced(|| -> Result<(), ImageError> { panic!("index out of bounds") });
+        assert!(matches!(found, Err(Undecodable::Panicked)));
+        assert!(!FENCED.get());
+        for name in ["fuzzed_465.jpg", "fuzzed_559.jpg", "coarse_brightness_scans.jpg", "coarse_brightness.jpg"] {
+            let error = read_picture(&crate::test_support::fixture("pictures").join(name)).unwrap_err().to_string();
+            assert!(error.contains(name), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_jpeg_that_is_cut_is_no_picture() {
+        for name in ["trunc_40.jpg", "trunc_90.jpg", "trunc_prog_60.jpg"] {
+            let error = read_picture(&crate::test_support::fixture("pictures").join(name)).unwrap_err().to_string();
+            assert!(error.contains(name) && error.contains("cut short"), "{error}");
+        }
     }
 
     /// The bytes of a picture in a format.

@@ -1,0 +1,88 @@
+//! The data of a run: what its configuration calls `street` or a folder, split in three.
+
+use std::collections::HashSet;
+use std::path::Path;
+use std::sync::Arc;
+
+use super::recipe::RunConfig;
+use super::run::RunData;
+use crate::data::kitti::{Kitti, Options};
+use crate::data::{Dataset, Subset};
+use crate::error::{Error, Result};
+use crate::street::{Street, StreetConfig};
+
+/// The name of the embedded street as a data set. A folder of that name is `./street`.
+pub const STREET: &str = "street";
+
+/// Sequences of the embedded street: training, validation, test. Many short drives: a street more teaches more than a
+/// few metres more of the same.
+const SEQUENCES: [usize; 3] = [144, 12, 24];
+/// Frames of each.
+const FRAMES: usize = 10;
+/// The seeds of validation and test lie far from that of training: three worlds that have no street in common.
+const APART: u64 = 1_000_000;
+
+/// Opens (or renders) the samples that a run trains on, validates on and reports on. `progress` hears what is rendered,
+/// how many frames are done and how many there are, from any thread.
+///
+/// # Errors
+/// If the data cannot be read, one frame is in two splits, or there are fewer samples than a batch holds.
+pub fn open(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + Sync)) -> Result<RunData> {
+    let data = if config.data == STREET { street(config, progress) } else { folder(config)? };
+    if data.train.len() < config.batch {
+        let message =
+            format!("{} samples a batch, but the data holds {}: make it smaller", config.batch, data.train.len());
+        return Err(Error::setting("batch", message));
+    }
+    Ok(data)
+}
+
+fn street(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + Sync)) -> RunData {
+    let RunConfig { height, width, seed, .. } = *config;
+    let street = |what: &'static str, sequences: usize, seed: u64| {
+        let settings = StreetConfig { height, width, sequences, frames: FRAMES, seed, ..StreetConfig::default() };
+        Arc::new(Street::render(&settings, Some(&|done, all| progress(what, done, all))))
+    };
+    let [train, validation, test] = SEQUENCES;
+    RunData {
+        train: street("street", train, seed),
+        validation: street("validation", validation, seed.wrapping_add(APART)),
+        test: Some(street("test", test, seed.wrapping_add(2 * APART))),
+    }
+}
+
+fn folder(config: &RunConfig) -> Result<RunData> {
+    let root = Path::new(&config.data);
+    let open = |split: Option<&Path>| Kitti::open(root, split, config.height, config.width, Options::default());
+    let all: Arc<dyn Dataset> = Arc::new(open(config.split.as_deref())?);
+    let (train, aside): (Arc<dyn Dataset>, Arc<dyn Dataset>) = match &config.val_split {
+        Some(split) => {
+            let aside: Arc<dyn Dataset> = Arc::new(open(Some(split))?);
+            apart(all.as_ref(), aside.as_ref(), split)?;
+            (all, aside)
+        }
+        None => {
+            let (aside, rest) = (0..all.len()).partition(|i| i % 10 == 9);
+            (Arc::new(Subset::new(all.clone(), rest)), Arc::new(Subset::new(all, aside)))
+        }
+    };
+    // What selects the weights is not what is reported on.
+    let (validation, mut test): (Vec<usize>, Vec<usize>) = (0..aside.len()).partition(|i| i % 2 == 0);
+    let with_truth: Result<Vec<bool>> = test.iter().map(|&i| Ok(aside.depth(i)?.is_some())).collect();
+    let mut with_truth = with_truth?.into_iter();
+    test.retain(|_| with_truth.next().unwrap_or(false));
+    Ok(RunData {
+        train,
+        validation: Arc::new(Subset::new(aside.clone(), validation)),
+        test: (!test.is_empty()).then(|| Arc::new(Subset::new(aside, test)) as Arc<dyn Dataset>),
+    })
+}
+
+/// Makes sure that no frame is trained on and validated on.
+fn apart(train: &dyn Dataset, aside: &dyn Dataset, split: &Path) -> Result<()> {
+    let trained: HashSet<String> = (0..train.len()).map(|i| train.name(i)).collect();
+    match (0..aside.len()).map(|i| aside.name(i)).find(|name| trained.contains(name)) {
+        Some(name) => Err(Error::file(split, format!("{name} is trained on, too: take it out of one of the lists"))),
+        None => Ok(()),
+    }
+}
