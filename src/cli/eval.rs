@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use parallax::Result;
 use parallax::data::Dataset;
-use parallax::data::kitti::{DepthAxis, GroundTruth, Kitti, Options};
+use parallax::data::kitti::{Camera, DepthAxis, GroundTruth, Kitti, Options};
 use parallax::eval::metrics::{Protocol, Scale};
 use parallax::eval::predictor::{Evaluation, Predictor, evaluate};
 use parallax::street::{Street, StreetConfig};
@@ -51,7 +51,9 @@ pub fn run(args: Args) -> Result<()> {
             Protocol::EigenCameraZ => GroundTruth::Lidar(DepthAxis::CameraZ),
             Protocol::Improved | Protocol::Dense => GroundTruth::Improved,
         };
-        let options = Options { neighbours: false, ground_truth, ..Options::default() };
+        // Depth is compared pixel by pixel: whichever camera took the pictures.
+        let camera = Camera::KittiPublished;
+        let options = Options { neighbours: false, ground_truth, camera, ..Options::default() };
         Box::new(Kitti::open(Path::new(&args.data), args.split.as_deref(), height, width, options)?)
     };
     let samples: Vec<usize> = (0..data.len()).collect();

@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
+use parallax::data::kitti::Camera;
 use parallax::monovit::{Preset, Setup};
 use parallax::train::data::{self, STREET};
 use parallax::train::recipe::{RunConfig, STEPS, read_config};
@@ -27,6 +28,17 @@ pub struct Args {
     /// The frames of a folder to validate on. Every tenth training frame is set aside, without.
     #[arg(long, value_name = "FILE")]
     val_split: Option<PathBuf>,
+    /// The camera that took a folder's pictures: its field of view in degrees across. Without, camera.toml among the data
+    /// says it (width, height, fx, fy, cx, cy in pixels, or fov), or the calibration.
+    #[arg(long, value_name = "DEGREES", conflicts_with_all = ["intrinsics", "camera"])]
+    fov: Option<f64>,
+    /// Its focal lengths and principal point, in pixels of the pictures as they are stored.
+    #[arg(long, value_name = "FX,FY,CX,CY", value_delimiter = ',', num_args = 4, conflicts_with = "camera")]
+    intrinsics: Option<Vec<f64>>,
+    /// KITTI's published constants (fx 0.58, fy 1.92 of the size) whatever the data say, or its calibration and nothing
+    /// else.
+    #[arg(long, value_name = "kitti-published|calibrated")]
+    camera: Option<NamedCamera>,
     /// The size of the networks; that of the weights to start from, or nano, unless given.
     #[arg(long)]
     preset: Option<Preset>,
@@ -103,6 +115,9 @@ pub fn run(args: Args) -> Result<()> {
         run.config.batch,
         run.folder.display()
     );
+    for camera in data.train.cameras() {
+        note!("camera: {camera}");
+    }
     let began = Instant::now();
     let mut progress = Progress::new("training", run.config.steps);
     let ended = run.train(&data, || stop.asked.load(Ordering::SeqCst), |event| show(&event, &mut progress, &stop))?;
@@ -126,6 +141,13 @@ pub fn run(args: Args) -> Result<()> {
         }
     }
     Ok(())
+}
+
+/// Cameras that are called by a name.
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum NamedCamera {
+    KittiPublished,
+    Calibrated,
 }
 
 /// Ctrl-C: whether it was pressed, and whether there is a step to be waited for.
@@ -271,6 +293,9 @@ impl Args {
             ("--learning-rate", self.learning_rate.is_some()),
             ("--seed", self.seed.is_some()),
             ("--val-split", self.val_split.is_some()),
+            ("--fov", self.fov.is_some()),
+            ("--intrinsics", self.intrinsics.is_some()),
+            ("--camera", self.camera.is_some()),
             ("--allow-partial", self.allow_partial),
             ("--log-every", self.log_every.is_some()),
             ("--checkpoint-every", self.checkpoint_every.is_some()),
@@ -330,6 +355,16 @@ fn configuration(args: &Args) -> Result<RunConfig> {
         c.init = args.init.iter().map(|p| std::path::absolute(p).unwrap_or_else(|_| p.clone())).collect();
     }
     c.allow_partial |= args.allow_partial;
+    c.camera = match (&args.intrinsics, args.fov, args.camera) {
+        (Some(numbers), ..) => match numbers[..] {
+            [fx, fy, cx, cy] => Camera::Pixels { fx, fy, cx, cy },
+            _ => return Err(Error::setting("--intrinsics", "expected four numbers: fx,fy,cx,cy")),
+        },
+        (None, Some(degrees), _) => Camera::Fov { degrees },
+        (None, None, Some(NamedCamera::KittiPublished)) => Camera::KittiPublished,
+        (None, None, Some(NamedCamera::Calibrated)) => Camera::Calibrated,
+        (None, None, None) => c.camera,
+    };
     args.networks.apply(&mut c.ablation);
     args.loss.apply(&mut c.loss);
     if let Some(rate) = args.learning_rate {

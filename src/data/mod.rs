@@ -34,6 +34,11 @@ pub trait Dataset: Send + Sync {
     /// The camera of a sample.
     fn intrinsics(&self, sample: usize) -> Intrinsics;
 
+    /// The cameras of all samples in words, each once: intrinsics, and where they were found.
+    fn cameras(&self) -> Vec<String> {
+        Vec::new()
+    }
+
     /// Ground-truth depth of the target frame at its own size, where there is one.
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>>;
 }
@@ -63,6 +68,9 @@ impl Dataset for Subset {
     }
     fn intrinsics(&self, sample: usize) -> Intrinsics {
         self.data.intrinsics(self.samples[sample])
+    }
+    fn cameras(&self) -> Vec<String> {
+        self.data.cameras()
     }
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {
         self.data.depth(self.samples[sample])

@@ -151,11 +151,18 @@ impl Input {
 /// An op with attributes and inputs on which its gradient is compared with finite differences.
 #[derive(Clone, Debug)]
 pub struct Case<O> {
-    /// What is special about it.
-    pub name: &'static str,
     /// The op.
     pub op: O,
-    /// Its inputs.
+    /// Everything else, which does not depend on the op: compiled once, not once for each op.
+    pub terms: Box<Terms>,
+}
+
+/// The inputs of a [`Case`], and what is promised of its gradients.
+#[derive(Clone, Debug)]
+pub struct Terms {
+    /// The name of the case: what is special about it.
+    pub name: &'static str,
+    /// The inputs of the op.
     pub inputs: Vec<Input>,
     /// The largest error allowed.
     pub tolerance: f64,
@@ -169,49 +176,50 @@ pub struct Case<O> {
     pub flat: bool,
 }
 
+impl Terms {
+    /// The shapes of the inputs.
+    pub fn shapes(&self) -> Vec<Shape> {
+        self.inputs.iter().map(|i| i.shape).collect()
+    }
+
+    fn new(name: &'static str, inputs: Vec<Input>) -> Box<Self> {
+        Box::new(Terms { name, inputs, tolerance: TOLERANCE, reason: None, kinks: 0, promise: None, flat: false })
+    }
+}
+
 impl<O> Case<O> {
     /// A case at the usual tolerance.
     pub fn new(name: &'static str, op: O, inputs: impl Into<Vec<Input>>) -> Self {
-        Case {
-            name,
-            op,
-            inputs: inputs.into(),
-            tolerance: TOLERANCE,
-            reason: None,
-            kinks: 0,
-            promise: None,
-            flat: false,
-        }
+        Case { op, terms: Terms::new(name, inputs.into()) }
     }
 
     /// Allows a larger error, for a reason that is printed.
     pub fn tolerance(mut self, tolerance: f64, reason: &'static str) -> Self {
-        self.tolerance = tolerance;
-        self.reason = Some(reason);
+        (self.terms.tolerance, self.terms.reason) = (tolerance, Some(reason));
         self
     }
 
     /// Says that this many elements sit on a kink; which value the op has there is [promised](Case::promises).
     pub fn kinks(mut self, count: usize) -> Self {
-        self.kinks = count;
+        self.terms.kinks = count;
         self
     }
 
     /// Says that the gradient of an input may rightly be zero here, though others are not.
     pub fn ignores(mut self, input: usize) -> Self {
-        self.inputs[input].ignored = true;
+        self.terms.inputs[input].ignored = true;
         self
     }
 
     /// Says what the gradient of an input is for cotangents of one.
     pub fn promises(mut self, input: usize, gradient: impl Into<Vec<f64>>) -> Self {
-        self.promise = Some((input, gradient.into()));
+        self.terms.promise = Some((input, gradient.into()));
         self
     }
 
     /// Says that every gradient is rightly zero here (an empty input, a saturated clamp).
     pub fn flat(mut self) -> Self {
-        self.flat = true;
+        self.terms.flat = true;
         self
     }
 }

@@ -5,7 +5,7 @@ use std::marker::PhantomData;
 
 use super::apply::execute;
 use super::attention::{factorised, relative_position};
-use super::case::{Case, Input};
+use super::case::{Case, Input, Terms};
 use super::conv::{conv2d, depthwise, transpose, upsampled};
 use super::depth::{disparity_to_depth, min_reprojection, photometric, pose, rotation, smoothness, ssim, warp};
 use super::elementwise::{activation, binary, dropout, pow, select, unary};
@@ -161,22 +161,10 @@ impl Entry {
 pub trait AnyCase {
     /// The op's name.
     fn op(&self) -> &'static str;
-    /// The case's name.
-    fn name(&self) -> &'static str;
     /// The kernel path it takes.
     fn algo(&self) -> &'static str;
-    /// Its inputs.
-    fn inputs(&self) -> &[Input];
-    /// The largest error allowed.
-    fn tolerance(&self) -> f64;
-    /// Why that is more than usual.
-    fn reason(&self) -> Option<&'static str>;
-    /// How many elements sit on a kink.
-    fn kinks(&self) -> usize;
-    /// An input and its gradient for cotangents of one, where the case promises it.
-    fn promise(&self) -> Option<(usize, &[f64])>;
-    /// Whether every gradient is rightly zero.
-    fn flat(&self) -> bool;
+    /// Its inputs, and what is promised of its gradients.
+    fn terms(&self) -> &Terms;
     /// How many of the outputs, at the end, are not differentiated.
     fn auxiliary(&self) -> usize;
     /// The shapes of all its outputs.
@@ -189,34 +177,46 @@ pub trait AnyCase {
     fn run_f32(&self, inputs: &[&Var<f32>]) -> Vec<Var<f32>>;
 }
 
+impl dyn AnyCase + '_ {
+    /// The case's name.
+    pub fn name(&self) -> &'static str {
+        self.terms().name
+    }
+    /// Its inputs.
+    pub fn inputs(&self) -> &[Input] {
+        &self.terms().inputs
+    }
+    /// The largest error allowed.
+    pub fn tolerance(&self) -> f64 {
+        self.terms().tolerance
+    }
+    /// Why that is more than usual.
+    pub fn reason(&self) -> Option<&'static str> {
+        self.terms().reason
+    }
+    /// How many elements sit on a kink.
+    pub fn kinks(&self) -> usize {
+        self.terms().kinks
+    }
+    /// An input and its gradient for cotangents of one, where the case promises it.
+    pub fn promise(&self) -> Option<(usize, &[f64])> {
+        self.terms().promise.as_ref().map(|(input, gradient)| (*input, &gradient[..]))
+    }
+    /// Whether every gradient is rightly zero.
+    pub fn flat(&self) -> bool {
+        self.terms().flat
+    }
+}
+
 impl<O: Op<f64> + Op<f32>> AnyCase for Case<O> {
     fn op(&self) -> &'static str {
         O::NAME
     }
-    fn name(&self) -> &'static str {
-        self.name
-    }
     fn algo(&self) -> &'static str {
-        let shapes: Vec<Shape> = self.inputs.iter().map(|i| i.shape).collect();
-        Op::<f64>::algo(&self.op, &shapes)
+        Op::<f64>::algo(&self.op, &self.terms.shapes())
     }
-    fn inputs(&self) -> &[Input] {
-        &self.inputs
-    }
-    fn tolerance(&self) -> f64 {
-        self.tolerance
-    }
-    fn reason(&self) -> Option<&'static str> {
-        self.reason
-    }
-    fn kinks(&self) -> usize {
-        self.kinks
-    }
-    fn promise(&self) -> Option<(usize, &[f64])> {
-        self.promise.as_ref().map(|(input, gradient)| (*input, &gradient[..]))
-    }
-    fn flat(&self) -> bool {
-        self.flat
+    fn terms(&self) -> &Terms {
+        &self.terms
     }
     fn outputs(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError> {
         Op::<f64>::shape(&self.op, inputs)

@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use super::rotations::{RotationPlan, Rotations};
 use crate::data::batch::Augment;
+use crate::data::kitti::Camera;
 use crate::error::{Error, Result};
 use crate::monovit::loss::LossConfig;
 use crate::monovit::setup::check_size;
@@ -204,6 +205,9 @@ pub struct RunConfig {
     /// A split list for a folder: every second frame validates, the others (with ground truth) are reported on. Every
     /// tenth training frame is set aside, without.
     pub val_split: Option<PathBuf>,
+    /// The camera that took a folder's pictures.
+    #[serde(default)]
+    pub camera: Camera,
     /// Weights to start from: files or folders, all four networks together.
     #[serde(default, deserialize_with = "none_one_or_many", skip_serializing_if = "Vec::is_empty")]
     pub init: Vec<PathBuf>,
@@ -258,6 +262,7 @@ impl RunConfig {
             data: "street".into(),
             split: None,
             val_split: None,
+            camera: Camera::Auto,
             init: Vec::new(),
             init_encoder: None,
             init_pose: None,

@@ -8,7 +8,7 @@ use super::Side;
 use crate::camera::Intrinsics;
 use crate::{Error, Result};
 
-const CAMERAS: &str = "calib_cam_to_cam.txt";
+pub(super) const CAMERAS: &str = "calib_cam_to_cam.txt";
 const LIDAR: &str = "calib_velo_to_cam.txt";
 
 /// What KITTI's calibration says about the two colour cameras and the LiDAR.
@@ -32,6 +32,11 @@ impl Calibration {
     /// Whether the folder of a day has both files.
     pub fn is_in(day: &Path) -> bool {
         day.join(CAMERAS).is_file() && day.join(LIDAR).is_file()
+    }
+
+    /// Whether the folder of a day says which cameras were used.
+    pub fn has_cameras(day: &Path) -> bool {
+        day.join(CAMERAS).is_file()
     }
 
     /// Reads the files in the folder of a day; that of the LiDAR only `with_lidar`.

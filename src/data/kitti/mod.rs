@@ -10,11 +10,12 @@
 //! Whatever can be wrong with a data set is found by [`Kitti::open`], before any time is spent on training.
 
 mod calibration;
+mod camera;
 mod lidar;
 mod scan;
 mod split;
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeMap, HashMap, HashSet, btree_map};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -22,6 +23,7 @@ use image::RgbImage;
 
 use crate::formats::depth_png::read_depth_png;
 pub use calibration::Calibration;
+pub use camera::Camera;
 pub use lidar::{DepthAxis, project_scan, read_scan};
 pub use split::{Side, SplitLine, read_split};
 
@@ -31,16 +33,6 @@ use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
 use crate::formats::picture::{check_picture, read_picture};
 use crate::{Error, Result};
-
-/// Whose intrinsics the samples carry.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Camera {
-    /// The constants of the published training, whatever the drive: [`Intrinsics::KITTI`].
-    #[default]
-    Published,
-    /// `P_rect_02` or `P_rect_03` of the day's `calib_cam_to_cam.txt`, over `S_rect`.
-    Calibrated,
-}
 
 /// Where ground-truth depth comes from.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -57,7 +49,7 @@ pub enum GroundTruth {
 }
 
 /// How a data set is opened.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Options {
     /// Every sample needs its previous and next frame (training); otherwise the target frame alone (evaluation).
     pub neighbours: bool,
@@ -72,12 +64,12 @@ pub struct Options {
 }
 
 impl Default for Options {
-    /// For training: with neighbours, published camera, any depth there is, a cache of 1 GiB.
+    /// For training: with neighbours, the camera that the data say, any depth there is, a cache of 1 GiB.
     fn default() -> Self {
         Options {
             neighbours: true,
             stereo: false,
-            camera: Camera::Published,
+            camera: Camera::Auto,
             ground_truth: GroundTruth::Auto,
             cache_bytes: 1 << 30,
         }
@@ -145,6 +137,8 @@ pub struct Kitti {
     height: u32,
     width: u32,
     options: Options,
+    /// Of each drive and side: the intrinsics, and where they were found.
+    cameras: BTreeMap<(usize, Side), (Intrinsics, String)>,
     cache: Mutex<Cache>,
 }
 
@@ -166,13 +160,29 @@ impl Kitti {
             height: side_of_picture("height", height)?,
             width: side_of_picture("width", width)?,
             options,
+            cameras: BTreeMap::new(),
             cache: Mutex::default(),
         };
         match split {
             Some(split) => kitti.take_split(root, split)?,
             None => kitti.take_everything(root)?,
         }
+        kitti.find_cameras(root)?;
         Ok(kitti)
+    }
+
+    /// Finds the camera of every drive and side that there are samples of.
+    fn find_cameras(&mut self, root: &Path) -> Result<()> {
+        for sample in 0..self.samples.len() {
+            let Frame { drive, side, .. } = self.samples[sample];
+            if let btree_map::Entry::Vacant(place) = self.cameras.entry((drive, side)) {
+                let frame = self.samples[sample];
+                let path = self.drives[drive].picture(frame.number, side).unwrap_or_else(|expected| expected);
+                let size = check_picture(&path)?;
+                place.insert(self.options.camera.resolve(root, &self.drives[drive].path, side, size)?);
+            }
+        }
+        Ok(())
     }
 
     fn take_split(&mut self, root: &Path, split: &Path) -> Result<()> {
@@ -234,14 +244,13 @@ impl Kitti {
     fn add_drive(&mut self, folder: &str, path: PathBuf, days: &mut HashMap<PathBuf, Arc<Calibration>>) -> Result<()> {
         let mut drive = Drive { folder: folder.to_owned(), path, calibration: None };
         let day = drive.day().to_owned();
-        let measured_camera = self.options.camera == Camera::Calibrated;
         let with_lidar = match self.options.ground_truth {
             GroundTruth::Lidar(_) => true,
             // Depth that nobody insists on does not make the calibration a duty.
             GroundTruth::Auto => Calibration::is_in(&day),
             GroundTruth::Improved | GroundTruth::Off => false,
         };
-        if measured_camera || with_lidar {
+        if with_lidar {
             if !days.contains_key(&day) {
                 days.insert(day.clone(), Arc::new(Calibration::read(&day, with_lidar)?));
             }
@@ -386,11 +395,18 @@ impl Dataset for Kitti {
 
     fn intrinsics(&self, sample: usize) -> Intrinsics {
         let frame = self.samples[sample];
-        match (self.options.camera, &self.drives[frame.drive].calibration) {
-            (Camera::Calibrated, Some(calibration)) => calibration.intrinsics(frame.side),
-            // A calibrated data set does not open without its calibration.
-            _ => Intrinsics::KITTI,
+        self.cameras[&(frame.drive, frame.side)].0
+    }
+
+    fn cameras(&self) -> Vec<String> {
+        let mut said: Vec<String> = Vec::new();
+        for (k, place) in self.cameras.values() {
+            let line = format!("fx {:.4}, fy {:.4}, cx {:.4}, cy {:.4} of the size: {place}", k.fx, k.fy, k.cx, k.cy);
+            if !said.contains(&line) {
+                said.push(line);
+            }
         }
+        said
     }
 
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {

@@ -41,10 +41,12 @@ fn message(result: Result<Kitti>) -> String {
     result.map(|kitti| names(&kitti)).unwrap_err().to_string()
 }
 
+const PUBLISHED: Options = Options { neighbours: true, cache_bytes: 1 << 20, ..TARGET_ONLY };
+
 const TARGET_ONLY: Options = Options {
     neighbours: false,
     stereo: false,
-    camera: Camera::Published,
+    camera: Camera::KittiPublished,
     ground_truth: GroundTruth::Auto,
     cache_bytes: 0,
 };
@@ -52,19 +54,19 @@ const TARGET_ONLY: Options = Options {
 #[test]
 fn without_a_list_every_frame_with_both_neighbours_is_a_sample() {
     let root = made_up(3..7);
-    let kitti = open(root.path(), None, Options::default()).unwrap();
+    let kitti = open(root.path(), None, PUBLISHED).unwrap();
     assert_eq!(names(&kitti), ["day/drive 4 l", "day/drive 5 l", "day/drive 4 r", "day/drive 5 r"]);
     assert_eq!(open(root.path(), None, TARGET_ONLY).unwrap().len(), 8);
     fs::remove_file(root.path().join("day/drive/image_02/data/0000000005.png")).unwrap();
-    assert_eq!(names(&open(root.path(), None, Options::default()).unwrap()), ["day/drive 4 r", "day/drive 5 r"]);
-    let stereo = open(root.path(), None, Options { stereo: true, ..Options::default() }).unwrap();
+    assert_eq!(names(&open(root.path(), None, PUBLISHED).unwrap()), ["day/drive 4 r", "day/drive 5 r"]);
+    let stereo = open(root.path(), None, Options { stereo: true, ..PUBLISHED }).unwrap();
     assert_eq!(names(&stereo), ["day/drive 4 r"]);
 }
 
 #[test]
 fn frames_come_at_the_size_asked_for_and_in_the_order_of_time() {
     let root = made_up(3..7);
-    let kitti = open(root.path(), Some("day/drive 5 r\nday/drive 4 l\n"), Options::default()).unwrap();
+    let kitti = open(root.path(), Some("day/drive 5 r\nday/drive 4 l\n"), PUBLISHED).unwrap();
     assert_eq!(names(&kitti), ["day/drive 5 r", "day/drive 4 l"]);
     for (offset, red) in [(-1, 40), (0, 50), (1, 60)] {
         let picture = kitti.image(0, offset).unwrap();
@@ -83,7 +85,7 @@ fn frames_come_at_the_size_asked_for_and_in_the_order_of_time() {
 fn the_cache_keeps_what_its_cap_allows() {
     let root = made_up(3..7);
     let frame = 12 * 8 * 3;
-    let kitti = open(root.path(), None, Options { cache_bytes: 2 * frame + 1, ..Options::default() }).unwrap();
+    let kitti = open(root.path(), None, Options { cache_bytes: 2 * frame + 1, ..PUBLISHED }).unwrap();
     for offset in [-1, 0, 1] {
         kitti.image(0, offset).unwrap();
     }

@@ -277,15 +277,15 @@ mod tests {
     fn every_pixel_is_spread_over_its_window() {
         let mut random = Random::new(1, 0);
         for case in ConvTranspose2d::cases() {
-            let [x, w] = [0, 1].map(|i| noise(case.inputs[i].shape, &mut random));
-            let bias = case.inputs.get(2).map(|b| noise(b.shape, &mut random));
+            let [x, w] = [0, 1].map(|i| noise(case.terms.inputs[i].shape, &mut random));
+            let bias = case.terms.inputs.get(2).map(|b| noise(b.shape, &mut random));
             let y = x.conv_transpose2d(&w, bias.as_ref(), case.op);
             let mut expected = Var::constant(spread(&case.op, x.value(), w.value(), y.shape()));
             if let Some(b) = &bias {
                 expected = &expected + b;
             }
             let far = (&y - &expected).value().data().iter().fold(0.0f64, |m, d| m.max(d.abs()));
-            assert!(far < 1e-13, "{}: off by {far:e}", case.name);
+            assert!(far < 1e-13, "{}: off by {far:e}", case.terms.name);
         }
     }
 

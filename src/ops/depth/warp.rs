@@ -490,7 +490,7 @@ impl Checked for Warp {
             Case::new(name, op, [source, Input::fixed("depth", [2, height, width, 1], 3.0, 6.0), transform(1)])
         };
         let mut far = case("far outside", false, 0, [4, 5, 3]);
-        far.inputs[1] = Input::fixed("depth", [2, 4, 5, 1], 0.2, 1.0);
+        far.terms.inputs[1] = Input::fixed("depth", [2, 4, 5, 1], 0.2, 1.0);
         vec![
             case("published grid", false, 0, [5, 8, 3]),
             case("consistent grid", true, 0, [5, 8, 3]),

@@ -150,11 +150,8 @@ fn planted(mutant: &'static Mutant) -> Vec<(Case<Planted>, Rc<dyn AnyCase>)> {
     let cases = entry.unwrap_or_else(|| panic!("no op is called {}", mutant.op)).cases();
     let plant = |real: Box<dyn AnyCase>| {
         let real: Rc<dyn AnyCase> = real.into();
-        let mut case = Case::new(real.name(), Planted { real: real.clone(), mutant }, real.inputs().to_vec());
-        (case.tolerance, case.reason, case.kinks, case.flat) =
-            (real.tolerance(), real.reason(), real.kinks(), real.flat());
-        case.promise = real.promise().map(|(input, gradient)| (input, gradient.to_vec()));
-        (case, real)
+        let terms = Box::new(real.terms().clone());
+        (Case { op: Planted { real: real.clone(), mutant }, terms }, real)
     };
     cases.into_iter().map(plant).collect()
 }

@@ -1,0 +1,219 @@
+//! Which camera took the pictures: what the user says, a `camera.toml` among the data, the calibration, or KITTI's constants.
+
+use std::fs;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use super::calibration::Calibration;
+use super::split::Side;
+use crate::camera::Intrinsics;
+use crate::{Error, Result};
+
+/// The intrinsics that samples carry.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "kind", deny_unknown_fields)]
+pub enum Camera {
+    /// The first of these that is there: `camera.toml` in the drive's folder or one above it up to the data's, the day's
+    /// `calib_cam_to_cam.txt`, and, for pictures of KITTI's aspect alone, the published constants.
+    #[default]
+    Auto,
+    /// The constants of the published training, whatever the drive: [`Intrinsics::KITTI`].
+    KittiPublished,
+    /// `P_rect_02` or `P_rect_03` of the day's `calib_cam_to_cam.txt`, over `S_rect`.
+    Calibrated,
+    /// A field of view, square pixels, and the principal point in the middle.
+    Fov {
+        /// Degrees across.
+        degrees: f64,
+    },
+    /// Focal lengths and principal point in pixels of the pictures as they are stored.
+    Pixels {
+        /// Horizontal focal length.
+        fx: f64,
+        /// Vertical focal length.
+        fy: f64,
+        /// Horizontal principal point.
+        cx: f64,
+        /// Vertical principal point.
+        cy: f64,
+    },
+}
+
+/// Width over height of KITTI's pictures.
+const KITTI_ASPECT: f64 = 1242.0 / 375.0;
+
+/// The name of the file that says which camera took the pictures beside it.
+const FILE: &str = "camera.toml";
+
+/// The content of `camera.toml`: a field of view, or focal lengths and principal point in pixels of a size.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct CameraFile {
+    width: Option<f64>,
+    height: Option<f64>,
+    fx: Option<f64>,
+    fy: Option<f64>,
+    cx: Option<f64>,
+    cy: Option<f64>,
+    fov: Option<f64>,
+}
+
+impl Camera {
+    /// The intrinsics of a drive's pictures, which are `width x height`, and where they were found; `root` is the folder
+    /// of all data.
+    ///
+    /// # Errors
+    /// If nothing is known of the camera, or what is said cannot be.
+    pub(super) fn resolve(
+        self,
+        root: &Path,
+        drive: &Path,
+        side: Side,
+        (width, height): (u32, u32),
+    ) -> Result<(Intrinsics, String)> {
+        let size = [f64::from(width), f64::from(height)];
+        let day = drive.parent().unwrap_or(drive);
+        match self {
+            Camera::KittiPublished => Ok((Intrinsics::KITTI, "KITTI's published constants".into())),
+            Camera::Calibrated => calibrated(day, side),
+            Camera::Fov { degrees } => {
+                let found = of_fov(degrees, size).map_err(|why| Error::setting("camera.degrees", why))?;
+                Ok((found, format!("a field of view of {degrees} degrees")))
+            }
+            Camera::Pixels { fx, fy, cx, cy } => {
+                let found = of_pixels([fx, fy, cx, cy], size).map_err(|why| Error::setting("camera", why))?;
+                Ok((found, "the intrinsics that were given".into()))
+            }
+            Camera::Auto => {
+                let above = drive.ancestors().take_while(|folder| folder.starts_with(root));
+                if let Some(file) = above.map(|folder| folder.join(FILE)).find(|file| file.is_file()) {
+                    return Ok((read(&file, size)?, file.display().to_string()));
+                }
+                if Calibration::has_cameras(day) {
+                    return calibrated(day, side);
+                }
+                if ((size[0] / size[1]) / KITTI_ASPECT - 1.0).abs() < 0.1 {
+                    return Ok((Intrinsics::KITTI, "KITTI's published constants, for want of a calibration".into()));
+                }
+                let message = format!(
+                    "nothing says which camera took these pictures of {width}x{height}: write {FILE} into this folder or \
+                     one above it (width, height, fx, fy, cx, cy in pixels, or fov in degrees across), or give --fov, \
+                     --intrinsics or --camera kitti-published"
+                );
+                Err(Error::file(drive, message))
+            }
+        }
+    }
+}
+
+fn calibrated(day: &Path, side: Side) -> Result<(Intrinsics, String)> {
+    let found = Calibration::read(day, false)?.intrinsics(side);
+    Ok((found, day.join(super::calibration::CAMERAS).display().to_string()))
+}
+
+/// Reads `camera.toml`, for pictures of a size.
+fn read(path: &Path, size: [f64; 2]) -> Result<Intrinsics> {
+    let text = fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+    let said: CameraFile = toml::from_str(&text).map_err(|e| Error::file(path, e.to_string()))?;
+    let found = match said {
+        CameraFile { fov: Some(fov), fx: None, fy: None, cx: None, cy: None, .. } => of_fov(fov, size),
+        CameraFile {
+            width: Some(w),
+            height: Some(h),
+            fx: Some(fx),
+            fy: Some(fy),
+            cx: Some(cx),
+            cy: Some(cy),
+            fov: None,
+        } => {
+            if ((w / h) / (size[0] / size[1]) - 1.0).abs() > 0.02 {
+                Err(format!("is for pictures of {w}x{h}, but these have {}x{}: another aspect", size[0], size[1]))
+            } else {
+                of_pixels([fx, fy, cx, cy], [w, h])
+            }
+        }
+        _ => Err("expected width, height, fx, fy, cx and cy in pixels, or fov in degrees across".into()),
+    };
+    found.map_err(|why| Error::file(path, why))
+}
+
+/// Square pixels, the principal point between the middle ones.
+fn of_fov(degrees: f64, [width, height]: [f64; 2]) -> Result<Intrinsics, String> {
+    if !(degrees > 0.0 && degrees < 180.0) {
+        return Err(format!("a field of view of {degrees} degrees: expected more than 0 and less than 180"));
+    }
+    let focal = 0.5 * width / (degrees / 2.0).to_radians().tan();
+    of_pixels([focal, focal, (width - 1.0) / 2.0, (height - 1.0) / 2.0], [width, height])
+}
+
+fn of_pixels([fx, fy, cx, cy]: [f64; 4], [width, height]: [f64; 2]) -> Result<Intrinsics, String> {
+    let focal = |f: f64| f > 0.0 && f.is_finite();
+    if !(focal(fx) && focal(fy) && width > 0.0 && height > 0.0) {
+        return Err(format!("focal lengths {fx}, {fy} of {width}x{height} pixels: expected numbers above 0"));
+    }
+    if !((0.0..=width).contains(&cx) && (0.0..=height).contains(&cy)) {
+        return Err(format!("a principal point at {cx}, {cy}, outside the picture of {width}x{height}"));
+    }
+    Ok(Intrinsics { fx: fx / width, fy: fy / height, cx: cx / width, cy: cy / height })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIZE: (u32, u32) = (800, 600);
+
+    /// What a drive's camera is found to be, with a `camera.toml` in the drive's folder.
+    fn found(text: Option<&str>, camera: Camera) -> Result<(Intrinsics, String)> {
+        let place = tempfile::tempdir().unwrap();
+        let drive = place.path().join("day/drive");
+        fs::create_dir_all(&drive).unwrap();
+        if let Some(text) = text {
+            fs::write(drive.join(FILE), text).unwrap();
+        }
+        camera.resolve(place.path(), &drive, Side::Left, SIZE)
+    }
+
+    #[test]
+    fn a_camera_file_is_exact_and_holds_for_any_size_of_its_aspect() {
+        let text = "width = 1600\nheight = 1200\nfx = 1000\nfy = 990\ncx = 820.5\ncy = 580";
+        let (camera, place) = found(Some(text), Camera::Auto).unwrap();
+        let expected = Intrinsics { fx: 0.625, fy: 0.825, cx: 820.5 / 1600.0, cy: 580.0 / 1200.0 };
+        assert_eq!(camera, expected);
+        assert!(place.ends_with(FILE));
+        let (wide, _) = found(Some("fov = 90"), Camera::Auto).unwrap();
+        assert!((wide.fx - 0.5).abs() < 1e-12 && (wide.fy - 400.0 / 600.0).abs() < 1e-12);
+        assert_eq!((wide.cx, wide.cy), (399.5 / 800.0, 299.5 / 600.0));
+    }
+
+    #[test]
+    fn what_the_user_says_wins_and_nothing_known_is_refused() {
+        let file = Some("fov = 90");
+        let said = Camera::Pixels { fx: 400.0, fy: 300.0, cx: 200.0, cy: 150.0 };
+        assert_eq!(found(file, said).unwrap().0, Intrinsics { fx: 0.5, fy: 0.5, cx: 0.25, cy: 0.25 });
+        assert_eq!(found(file, Camera::KittiPublished).unwrap().0, Intrinsics::KITTI);
+        let error = found(None, Camera::Auto).unwrap_err().to_string();
+        assert!(error.contains("drive") && error.contains("800x600") && error.contains("--fov"), "{error}");
+    }
+
+    #[test]
+    fn a_camera_that_cannot_be_is_refused_by_file() {
+        for text in [
+            "",
+            "fov = 0",
+            "fov = 200",
+            "fov = nan",
+            "fov = 60\nfx = 3",
+            "width = 800\nheight = 600\nfx = 500\nfy = 500\ncx = 400",
+            "width = 800\nheight = 600\nfx = -500\nfy = 500\ncx = 400\ncy = 300",
+            "width = 800\nheight = 600\nfx = 500\nfy = inf\ncx = 400\ncy = 300",
+            "width = 800\nheight = 600\nfx = 500\nfy = 500\ncx = 900\ncy = 300",
+            "width = 800\nheight = 300\nfx = 500\nfy = 500\ncx = 400\ncy = 200",
+            "focal = 3",
+        ] {
+            let error = found(Some(text), Camera::Auto).unwrap_err().to_string();
+            assert!(error.contains(FILE), "{text}: {error}");
+        }
+    }
+}
