@@ -66,7 +66,7 @@ impl Network {
     }
 }
 
-fn main() {
+pub fn main() {
     let mut params = Params::new();
     let network = Network::new(&mut Builder::new(&mut params, &mut Random::new(0, 0)));
     let mut adamw = AdamW::new(&params);

@@ -7,9 +7,9 @@ use image::RgbImage;
 use parallax::camera::Intrinsics;
 use parallax::data::inputs::{Input, find_pictures};
 use parallax::data::resize::lanczos;
-use parallax::depth::DepthMap;
+use parallax::depth::InverseDepth;
 use parallax::eval::camera_height::find_ground;
-use parallax::eval::metrics::{STEREO_SCALE, median, resize_bilinear};
+use parallax::eval::metrics::{STEREO_SCALE, median};
 use parallax::eval::predictor::Predictor;
 use parallax::formats::atomic::{check_writable, write_bytes_atomically};
 use parallax::formats::depth_png::write_depth_png;
@@ -235,31 +235,29 @@ fn predict(args: &Args, predictor: &Predictor, job: Job, (height, width): (usize
     let (w, h) = (picture.width() as usize, picture.height() as usize);
     let camera = args.camera(w as f64, h as f64);
     let map = predictor.inverse_depth(&lanczos(&picture, width as u32, height as u32), args.flip);
-    if !map.iter().all(|d| d.is_finite() && *d > 0.0) {
+    if !map.is_whole() {
         let message = "the network's depth of it is not finite: the weights are broken";
         return Err(Error::file(&job.input.path, message));
     }
-    let factor = args.factor(&job.input, &map, (height, width), camera)?;
-    let median_depth = median(map.iter().map(|&d| factor / f64::from(d)).collect()).unwrap_or(f64::NAN);
-    let inverse = resize_bilinear(&map, (height, width), (h, w));
-    let inverse: Vec<f32> = inverse.into_iter().map(|d| (d / factor) as f32).collect();
-    write(&job.outputs, &picture, inverse, camera)?;
+    let factor = args.factor(&job.input, &map.values, (height, width), camera)?;
+    let median_depth = median(map.values.iter().map(|&d| factor / f64::from(d)).collect()).unwrap_or(f64::NAN);
+    write(&job.outputs, &picture, &map.resized(h, w, factor), camera)?;
     let input = job.input.path.to_string_lossy().into_owned();
     let seconds = started.elapsed().as_secs_f64();
     Ok(Done { input, outputs: job.outputs, width: w, height: h, factor, median_depth, seconds })
 }
 
 /// Writes what is wanted of a picture's inverse depth.
-fn write(outputs: &Outputs, picture: &RgbImage, inverse: Vec<f32>, camera: Intrinsics) -> Result<()> {
-    let (width, height) = (picture.width() as usize, picture.height() as usize);
-    write_png(&outputs.disparity, &disparity_to_image(&inverse, width, height))?;
+fn write(outputs: &Outputs, picture: &RgbImage, inverse: &InverseDepth, camera: Intrinsics) -> Result<()> {
+    let (height, width) = inverse.size();
+    write_png(&outputs.disparity, &disparity_to_image(&inverse.values, width, height))?;
     if let Some(path) = &outputs.inverse_depth {
-        write_npy(path, &inverse, height, width)?;
+        write_npy(path, &inverse.values, height, width)?;
     }
     if outputs.depth.is_none() && outputs.points.is_none() {
         return Ok(());
     }
-    let depth = DepthMap { width, height, metres: inverse.into_iter().map(|d| 1.0 / d).collect() };
+    let depth = inverse.depth();
     if let Some(path) = &outputs.depth {
         write_depth_png(path, &depth)?;
     }

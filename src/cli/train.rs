@@ -70,7 +70,8 @@ pub struct Args {
     /// The seed that everything random follows from; 0 unless given.
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
-    /// A configuration such as a run's config.toml; flags win over it.
+    /// A configuration such as a run's config.toml, whole or in part; flags win over it. It decides the recipe for weights
+    /// to start from, too.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Weights to start from, all four networks: a run, a file, a folder with encoder.pth, depth.pth, ...; several times
@@ -89,7 +90,7 @@ pub struct Args {
     /// Go on with an interrupted run.
     #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "config", "init", "init_encoder", "init_pose", "split", "preset"])]
     resume: Option<PathBuf>,
-    /// The run's folder, new or empty.
+    /// The run's folder, new or empty; the first of runs/1, runs/2, ... that is not there, unless given.
     #[arg(long, value_name = "RUN")]
     out: Option<PathBuf>,
     /// Print `metrics.json` on standard output at the end, and nothing else there.
@@ -134,7 +135,9 @@ pub fn run(args: Args) -> Result<()> {
             if args.json {
                 super::print_json(&metrics)?;
             }
-            let start = if run.config.init.is_empty() { "untrained" } else { "start" };
+            let RunConfig { init, init_encoder, init_pose, .. } = &run.config;
+            let from_files = !init.is_empty() || init_encoder.is_some() || init_pose.is_some();
+            let start = if from_files { "start" } else { "untrained" };
             print_metrics(&metrics, start);
             let seconds = began.elapsed().as_secs_f64();
             note!("done in {seconds:.0} s, {:.0} s of them training; look at {folder}/images", metrics.seconds);
@@ -323,12 +326,10 @@ fn absolute(data: &str) -> String {
 fn configuration(args: &Args) -> Result<RunConfig> {
     let mut c = match &args.config {
         Some(path) => read_config(path)?,
-        None if !args.init.is_empty() && args.preset.is_none() => {
-            RunConfig::from_weights(weights::setup_of(&args.init)?, STEPS)
-        }
         None if !args.init.is_empty() => {
-            let preset = preset(args)?;
-            RunConfig::from_weights(Setup::of(preset), STEPS)
+            // Where weights do not say it the preset does; whether they fit it is found out when they are read.
+            let setup = weights::setup_of(&args.init).or_else(|e| args.preset.map(Setup::of).ok_or(e))?;
+            RunConfig::from_weights(setup, STEPS)
         }
         None if args.init_encoder.is_some() => RunConfig::from_encoder(preset(args)?, STEPS),
         None => RunConfig::new(preset(args)?, STEPS),

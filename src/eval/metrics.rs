@@ -9,7 +9,7 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use crate::data::Dataset;
-use crate::depth::DepthMap;
+use crate::depth::{DepthMap, resize_bilinear};
 use crate::{Error, Result};
 
 /// Depth is compared from here on, in metres; predictions are cut to the same range.
@@ -236,35 +236,6 @@ pub fn median(mut values: Vec<f64>) -> Option<f64> {
     // The lower of the middle two is the largest of what lies below.
     let lower = below.iter().copied().max_by(f64::total_cmp).filter(|_| middle * 2 == values.len());
     Some(lower.map_or(upper, |lower| (lower + upper) / 2.0))
-}
-
-/// Bilinear resize of a row-major map from `(h, w)` to `(h, w)`, without antialiasing, in f64. Pixel centres are at
-/// halves (align_corners false): output i reads the input at `(i + 1/2) in/out - 1/2`, cut to the map.
-///
-/// # Panics
-/// If `map` does not hold `from.0 * from.1` values or a size is empty.
-pub fn resize_bilinear(map: &[f32], from: (usize, usize), to: (usize, usize)) -> Vec<f64> {
-    assert_eq!(map.len(), from.0 * from.1, "resize_bilinear: a map of {from:?} expected");
-    let taps = |input: usize, output: usize| -> Vec<(usize, usize, f64)> {
-        assert!(input > 0 && output > 0, "resize_bilinear: {from:?} to {to:?}");
-        let scale = input as f64 / output as f64;
-        let tap = |i: usize| {
-            let x = ((i as f64 + 0.5) * scale - 0.5).max(0.0);
-            let below = (x as usize).min(input - 1);
-            (below, (below + 1).min(input - 1), x - below as f64)
-        };
-        (0..output).map(tap).collect()
-    };
-    let columns = taps(from.1, to.1);
-    let mut out = Vec::with_capacity(to.0 * to.1);
-    for (above, below, t) in taps(from.0, to.0) {
-        let (above, below) = (&map[above * from.1..], &map[below * from.1..]);
-        out.extend(columns.iter().map(|&(left, right, s)| {
-            let along = |row: &[f32]| (1.0 - s) * f64::from(row[left]) + s * f64::from(row[right]);
-            (1.0 - t) * along(above) + t * along(below)
-        }));
-    }
-    out
 }
 
 /// Flip post-processing: joins the prediction `left` of an image with `right`, the prediction of the mirrored image

@@ -1,12 +1,17 @@
 //! Depth of pictures, and how good it is against ground truth.
 
+use std::path::Path;
+
 use super::metrics::{MeanMap, Protocol, Report, Scale, evaluate_image, flip_post_process, mirror};
 use crate::data::Dataset;
 use crate::data::augment::flip;
 use crate::data::batch::to_tensor;
+use crate::data::resize::lanczos;
+use crate::depth::{Disparity, InverseDepth};
 use crate::error::{Error, Result};
 use crate::monovit::{MonoVit, Setup};
 use crate::nn::{Folded, Params};
+use crate::weights::{self, Need, Weights};
 use image::RgbImage;
 
 /// How to predict and to compare.
@@ -20,38 +25,95 @@ pub struct Evaluation {
     pub flip: bool,
 }
 
-/// A predictor: the networks with weights in evaluation mode.
-pub struct Predictor<'a> {
-    model: &'a MonoVit,
+/// Depth of single pictures: the networks with weights in evaluation mode.
+///
+/// ```no_run
+/// use parallax::eval::predictor::Predictor;
+/// use parallax::formats::picture::read_picture;
+///
+/// let predictor = Predictor::load("runs/1")?;
+/// let prediction = predictor.depth_of(&read_picture("street.jpg".as_ref())?)?;
+/// println!("{:?}: {:?}", prediction.inverse_depth.unit, prediction.inverse_depth.depth().metres[0]);
+/// # Ok::<(), parallax::Error>(())
+/// ```
+pub struct Predictor {
+    model: MonoVit,
     params: Folded<f32>,
-    nearest: f32,
-    farthest: f32,
+    setup: Setup,
 }
 
-impl<'a> Predictor<'a> {
-    /// The networks with these weights; `setup` gives the range of depths.
-    pub fn new(model: &'a MonoVit, params: &Params<f32>, setup: &Setup) -> Self {
-        let (nearest, farthest) = (setup.min_depth as f32, setup.max_depth as f32);
-        Predictor { model, params: Folded::new(params), nearest, farthest }
+/// The depth of a picture.
+#[derive(Clone, Debug)]
+pub struct Prediction {
+    /// Sigmoid disparity at the size of the networks' pictures.
+    pub disparity: Disparity,
+    /// Inverse depth at the picture's own size, in its unit.
+    pub inverse_depth: InverseDepth,
+}
+
+impl Predictor {
+    /// The networks with these weights; `setup` gives the size of their pictures and the range of depths.
+    pub fn new(model: &MonoVit, params: &Params<f32>, setup: &Setup) -> Self {
+        Predictor { model: model.clone(), params: Folded::new(params), setup: *setup }
     }
 
-    /// Sigmoid disparity of a picture whose sides are multiples of 32, row-major.
-    pub fn disparity(&self, image: &RgbImage) -> Vec<f32> {
-        self.model.predict(&self.params, &to_tensor(&[image])).swap_remove(0).data().to_vec()
+    /// Reads weights: a run's folder, or any file or folder that [`weights::load`] takes.
+    ///
+    /// # Errors
+    /// As [`weights::load`].
+    pub fn load(path: impl AsRef<Path>) -> Result<Self> {
+        let Weights { model, params, setup, .. } = weights::load(&[path.as_ref().to_owned()], Need::Depth, false)?;
+        Ok(Self::new(&model, &params, &setup))
     }
 
-    /// Inverse depth (up to scale) of a picture: `1/max + (1/min - 1/max) disparity`.
-    pub fn inverse_depth(&self, image: &RgbImage, flipped_too: bool) -> Vec<f32> {
-        let (near, far) = (1.0 / self.nearest, 1.0 / self.farthest);
-        let scaled = |d: Vec<f32>| -> Vec<f32> { d.into_iter().map(|d| far + (near - far) * d).collect() };
-        if !flipped_too {
-            return scaled(self.disparity(image));
+    /// The networks, the size of their pictures and the range of their depths.
+    pub fn setup(&self) -> &Setup {
+        &self.setup
+    }
+
+    /// The depth of a picture of any size, which the networks see at theirs (resized, whatever its aspect). Depths are
+    /// relative: from one camera alone they have no unit.
+    ///
+    /// # Errors
+    /// If the picture is empty, or what the networks say is not finite, as with broken weights.
+    pub fn depth_of(&self, picture: &RgbImage) -> Result<Prediction> {
+        let (width, height) = picture.dimensions();
+        if width == 0 || height == 0 {
+            return Err(Error::Failed("an empty picture has no depth".into()));
         }
-        let width = image.width() as usize;
-        let both = self.model.predict(&self.params, &to_tensor(&[image, &flip(image)])).swap_remove(0);
-        let (plain, mirrored) = both.data().split_at(both.len() / 2);
-        let mirrored = mirror(&scaled(mirrored.to_vec()), width);
-        flip_post_process(&scaled(plain.to_vec()), &mirrored, width)
+        let seen = lanczos(picture, self.setup.width as u32, self.setup.height as u32);
+        let disparity = self.disparity(&seen);
+        let inverse_depth = disparity.inverse_depth(self.setup.min_depth, self.setup.max_depth);
+        if !inverse_depth.is_whole() {
+            return Err(Error::Failed("the networks' depth is not finite: the weights are broken".into()));
+        }
+        let inverse_depth = inverse_depth.resized(height as usize, width as usize, 1.0);
+        Ok(Prediction { disparity, inverse_depth })
+    }
+
+    /// Sigmoid disparity of a picture whose sides are multiples of 32.
+    pub fn disparity(&self, image: &RgbImage) -> Disparity {
+        self.disparities(&[image]).swap_remove(0)
+    }
+
+    fn disparities(&self, images: &[&RgbImage]) -> Vec<Disparity> {
+        let (width, height) = (images[0].width() as usize, images[0].height() as usize);
+        let all = self.model.predict(&self.params, &to_tensor(images)).swap_remove(0);
+        let each = all.data().chunks_exact(width * height);
+        each.map(|values| Disparity { width, height, values: values.to_vec() }).collect()
+    }
+
+    /// Inverse depth of a picture whose sides are multiples of 32; `flipped_too` joins it with that of the mirrored
+    /// picture ([`flip_post_process`]).
+    pub fn inverse_depth(&self, image: &RgbImage, flipped_too: bool) -> InverseDepth {
+        let inverse = |d: &Disparity| d.inverse_depth(self.setup.min_depth, self.setup.max_depth);
+        if !flipped_too {
+            return inverse(&self.disparity(image));
+        }
+        let both = self.disparities(&[image, &flip(image)]);
+        let (plain, mirrored) = (inverse(&both[0]), inverse(&both[1]));
+        let mirrored = mirror(&mirrored.values, plain.width);
+        InverseDepth { values: flip_post_process(&plain.values, &mirrored, plain.width), ..plain }
     }
 }
 
@@ -69,7 +131,9 @@ pub fn evaluate(
 ) -> Result<Report> {
     compare(data, samples, how, seen, |sample| {
         let image = data.image(sample, 0)?;
-        Ok((predictor.inverse_depth(&image, how.flip), (image.height() as usize, image.width() as usize)))
+        let found = predictor.inverse_depth(&image, how.flip);
+        let size = found.size();
+        Ok((found.values, size))
     })
 }
 

@@ -180,8 +180,10 @@ fn write_images(folder: &Path, predictor: &Predictor, data: &dyn Dataset) -> Res
         let sample = i * data.len() / count;
         let image = data.image(sample, 0)?;
         let (w, h) = image.dimensions();
-        let mut rows =
-            vec![image.as_ref().clone(), disparity_to_image(&predictor.disparity(&image), w as usize, h as usize)];
+        let mut rows = vec![
+            image.as_ref().clone(),
+            disparity_to_image(&predictor.disparity(&image).values, w as usize, h as usize),
+        ];
         if let Some(truth) = data.depth(sample)?
             && (truth.width, truth.height) == (w as usize, h as usize)
         {
