@@ -83,7 +83,7 @@ pub fn main() {
             println!("step {step}: cross-entropy {:.3}", loss.value().item());
         }
     }
-    println!("300 steps in {:.2} s", start.elapsed().as_secs_f64());
+    println!("300 steps in {:.2} seconds", start.elapsed().as_secs_f64());
     let (pictures, digits) = draw(1000, &mut random);
     let logits = network.forward(&Context::inference(&params), pictures);
     let [_, read] = logits.max(1, 1);

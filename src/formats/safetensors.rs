@@ -81,7 +81,7 @@ pub fn write<T: Float>(
 /// # Errors
 /// If the header does not describe the file exactly: every tensor a range of the length that its shape needs, no two
 /// overlapping, nothing left over. Nothing larger than the header is read before that is known. If the numbers are not
-/// those of the checksum that [`write`] added.
+/// those of the checksum that [`write`](write()) added.
 pub fn open(path: &Path) -> Result<TensorFile> {
     let io = |e| Error::io(path, e);
     let not = |why: String| Error::file(path, format!("not a safetensors file: {why}"));
