@@ -58,4 +58,4 @@ mod test_support;
 pub mod train;
 pub mod weights;
 
-pub use error::{Error, Result};
+pub use error::{Error, Result, printable};

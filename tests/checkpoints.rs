@@ -585,3 +585,28 @@ fn the_program_converts_and_predicts_the_same_from_every_form() {
     assert!(started.elapsed() < Duration::from_secs(5), "something was rendered first");
     assert!(!Path::new(&path("run")).exists(), "nothing was made");
 }
+
+/// Files of one network's weights with what training programs keep beside them: none of it is in the way.
+#[test]
+fn what_stands_beside_the_weights_never_blocks_a_file() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/pth/beside");
+    let expected = parallax::formats::safetensors::read::<f32>(&folder.join("pose.safetensors"))
+        .expect("the weights alone")
+        .tensors;
+    let mut files = 0;
+    for entry in std::fs::read_dir(&folder).expect("the fixtures").flatten() {
+        let path = entry.path();
+        if path.extension().is_none_or(|ending| ending != "pth") {
+            continue;
+        }
+        let weights = weights::load(&[path.clone()], Need::Only("pose"), false);
+        let weights = weights.unwrap_or_else(|e| panic!("{e}"));
+        let found = weights.params.export();
+        for (name, tensor) in &expected {
+            let own = format!("pose.{}", name.strip_prefix("pose.").unwrap_or(name));
+            assert!(found.get(&own).is_some_and(|t| t.same_bits(tensor)), "{}: {own}", path.display());
+        }
+        files += 1;
+    }
+    assert_eq!(files, 10);
+}

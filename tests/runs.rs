@@ -216,7 +216,9 @@ fn a_damaged_state_is_named_and_the_one_before_it_is_taken() {
     assert_eq!(run.steps(), 4, "the checkpoint before the last");
     assert!(told.len() == 1 && told[0].contains("state.safetensors") && told[0].contains("damaged"), "{told:?}");
     drop(run);
-    std::fs::remove_file(folder.join("checkpoints/previous.safetensors")).expect("there");
+    assert_eq!(Run::resume(&folder).expect("the whole one is still there").steps(), 4);
+    std::fs::write(folder.join("checkpoints/previous.safetensors"), &bytes).expect("damaged, too");
+    std::fs::rename(folder.join("checkpoints/previous.safetensors"), &state).expect("moved");
     let error = Run::resume(&folder).err().expect("refused").to_string();
     assert!(error.contains("state.safetensors") && error.contains("damaged"), "{error}");
 }
@@ -248,6 +250,7 @@ fn an_interrupted_run_has_weights_and_a_finished_one_can_be_prolonged() {
     let folder = place.path().join("run");
     let data = data();
     let mut run = Run::create(&folder, config()).expect("a run");
+    load_weights(&folder).expect("weights before the first step");
     assert_eq!(interrupted(&mut run, &data, |e| matches!(e, Event::Step(r) if r.step == 1)), 1);
     drop(run);
     load_weights(&folder).expect("weights before the first validation");
@@ -395,9 +398,10 @@ fn a_batch_larger_than_the_data_is_refused() {
 fn a_folder_that_holds_something_is_not_written_into() {
     let place = tempfile::tempdir().expect("a folder");
     std::fs::write(place.path().join("precious.txt"), "mine").expect("written");
+    std::fs::write(place.path().join(".x.1-2.tmp"), "mine, too").expect("written");
     let error = Run::create(place.path(), config()).err().expect("refused").to_string();
     assert!(error.contains("not empty") && error.contains("--resume"), "{error}");
-    assert_eq!(std::fs::read_dir(place.path()).expect("readable").count(), 1);
+    assert_eq!(std::fs::read_dir(place.path()).expect("readable").count(), 2);
 }
 
 #[test]

@@ -28,7 +28,7 @@ mod weights;
 use std::process::ExitCode;
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
-use parallax::{Error, Result};
+use parallax::{Error, Result, printable};
 
 /// Monocular depth without supervision, from scratch on the CPU: train MonoViT, predict depth, check every gradient.
 #[derive(Parser)]
@@ -123,13 +123,13 @@ fn print_json(value: &impl serde::Serialize) -> Result<()> {
 /// Writes a line for `note!`. A terminal that is gone, or a full disk behind a log, is no reason to stop.
 fn note(text: std::fmt::Arguments) {
     use std::io::Write;
-    let _ = writeln!(std::io::stderr(), "{text}");
+    let _ = writeln!(std::io::stderr(), "{}", printable(&text.to_string()));
 }
 
 /// Writes a line for `say!`. Nobody reads on when this ends the program, and all that was made is already written.
 fn say(text: std::fmt::Arguments) {
     use std::io::{ErrorKind, Write};
-    if let Err(error) = writeln!(std::io::stdout(), "{text}") {
+    if let Err(error) = writeln!(std::io::stdout(), "{}", printable(&text.to_string())) {
         if error.kind() == ErrorKind::BrokenPipe {
             std::process::exit(0);
         }

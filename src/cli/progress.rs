@@ -51,7 +51,7 @@ impl Progress {
 
     /// A line above the bar.
     pub fn say(&self, line: &str) {
-        if self.plain { note!("{line}") } else { self.bar.println(line) }
+        if self.plain { note!("{line}") } else { self.bar.println(parallax::printable(line)) }
     }
 
     /// Takes the bar away.

@@ -2,6 +2,7 @@
 //!
 //! What a batch holds is a function of the seed and the step alone, so a resumed run sees what it would have seen.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::thread::JoinHandle;
@@ -171,7 +172,17 @@ impl Loader {
         let (send, batches) = sync_channel(3);
         let thread = std::thread::spawn(move || {
             for step in first_step.. {
-                let made = batch_of_step(data.as_ref(), augment, batch, seed, step);
+                let make = || batch_of_step(data.as_ref(), augment, batch, seed, step);
+                // A panic becomes an error of this step, not a thread that is gone.
+                let made = catch_unwind(AssertUnwindSafe(make)).unwrap_or_else(|_| {
+                    let samples = samples_of_step(data.len(), batch, seed, step);
+                    let names: Vec<String> = samples.into_iter().map(|sample| data.name(sample)).collect();
+                    Err(Error::Failed(format!(
+                        "the batch of step {} could not be made ({})",
+                        step + 1,
+                        names.join(", ")
+                    )))
+                });
                 let last = made.is_err();
                 // The other end hangs up when training is over.
                 if send.send(made).is_err() || last {

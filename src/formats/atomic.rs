@@ -19,17 +19,24 @@ fn aside(path: &Path) -> Result<PathBuf> {
     Ok(folder.join(format!(".{}.{}-{number}.tmp", name.to_string_lossy(), std::process::id())))
 }
 
-/// Removes what killed writers left in a folder: nobody else may be writing into it.
+/// Removes what killed writers left in a folder: nobody else may be writing into it. Files of other names than this
+/// module gives (`.NAME.PROCESS-NUMBER.tmp`) are left alone.
 pub fn clean(folder: impl AsRef<Path>) {
     let Ok(entries) = fs::read_dir(folder) else { return };
     for entry in entries.flatten() {
         let name = entry.file_name();
-        let name = name.to_string_lossy();
-        if name.starts_with('.') && name.ends_with(".tmp") {
+        if is_aside(&name.to_string_lossy()) {
             // What cannot be removed costs nothing but its place on the disk.
             let _ = fs::remove_file(entry.path());
         }
     }
+}
+
+/// Whether this module gave a file its name, while it was being written.
+pub fn is_aside(name: &str) -> bool {
+    let numbers = name.strip_prefix('.').and_then(|n| n.strip_suffix(".tmp")).and_then(|n| n.rsplit_once('.'));
+    let digits = |text: &str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
+    numbers.and_then(|(_, numbers)| numbers.split_once('-')).is_some_and(|(pid, n)| digits(pid) && digits(n))
 }
 
 /// Writes a file through `write` so that nobody ever sees half of it: into a temporary file in the same folder,
@@ -91,13 +98,13 @@ mod tests {
     #[test]
     fn what_killed_writers_left_is_removed_and_nothing_else() {
         let folder = tempfile::tempdir().unwrap();
-        for name in [".state.safetensors.123-0.tmp", "state.safetensors", ".hidden", "notes.tmp"] {
+        for name in [".state.safetensors.123-0.tmp", "state.safetensors", ".hidden", "notes.tmp", ".mine.tmp"] {
             fs::write(folder.path().join(name), name).unwrap();
         }
         clean(folder.path());
         let mut left: Vec<_> = fs::read_dir(folder.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
         left.sort();
-        assert_eq!(left, [".hidden", "notes.tmp", "state.safetensors"]);
+        assert_eq!(left, [".hidden", ".mine.tmp", "notes.tmp", "state.safetensors"]);
     }
 
     #[test]

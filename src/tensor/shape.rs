@@ -18,13 +18,24 @@ impl Shape {
     /// A shape with the given extents.
     ///
     /// # Panics
-    /// If there are more than [`MAX_RANK`].
+    /// If there are more than [`MAX_RANK`], or more elements than memory has addresses.
     #[track_caller]
     pub fn new(dims: &[usize]) -> Self {
         assert!(dims.len() <= MAX_RANK, "a tensor has at most {MAX_RANK} dimensions, not {}", dims.len());
         let mut all = [1; MAX_RANK];
         all[..dims.len()].copy_from_slice(dims);
-        Shape { dims: all, rank: dims.len() as u8 }
+        Shape { dims: all, rank: dims.len() as u8 }.counted()
+    }
+
+    /// This shape, whose elements and strides are known not to overflow: an extent of 0 does not excuse the others.
+    #[track_caller]
+    fn counted(self) -> Self {
+        let product = self.dims().iter().try_fold(1usize, |product, &d| product.checked_mul(d.max(1)));
+        assert!(
+            product.is_some_and(|n| n <= isize::MAX as usize / 8),
+            "a tensor of shape {self} has more elements than memory has room for"
+        );
+        self
     }
 
     /// The extents.
@@ -74,13 +85,13 @@ impl Shape {
     /// The same shape with dimension `axis` set to `extent`.
     ///
     /// # Panics
-    /// If `axis` is out of range.
+    /// If `axis` is out of range, or there are more elements than memory has addresses.
     #[track_caller]
     pub fn with(&self, axis: usize, extent: usize) -> Self {
         assert!(axis < self.rank(), "no dimension {axis} in a tensor of shape {self}");
         let mut shape = *self;
         shape.dims[axis] = extent;
-        shape
+        shape.counted()
     }
 
     /// The same shape without dimension `axis`.
@@ -109,7 +120,7 @@ impl Shape {
                 _ => return None,
             };
         }
-        Some(Shape { dims, rank: rank as u8 })
+        Some(Shape { dims, rank: rank as u8 }.counted())
     }
 }
 
@@ -152,6 +163,18 @@ impl<const N: usize> From<&[usize; N]> for Shape {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn more_elements_than_memory_has_room_for_are_refused() {
+        let huge = 1usize << 63;
+        for dims in [&[huge, 2][..], &[huge, 0], &[0, huge, huge], &[1 << 31, 1 << 31, 1 << 31]] {
+            assert!(std::panic::catch_unwind(|| Shape::new(dims)).is_err(), "{dims:?}");
+        }
+        assert!(std::panic::catch_unwind(|| Shape::new(&[1 << 40, 1]).with(1, 1 << 40)).is_err());
+        let wide = [Shape::new(&[1 << 40, 1]), Shape::new(&[1, 1 << 40])];
+        assert!(std::panic::catch_unwind(|| wide[0].broadcast(&wide[1])).is_err());
+        assert!(std::panic::catch_unwind(|| crate::tensor::Tensor::<f32>::from_vec([huge, 2], vec![])).is_err());
+    }
 
     #[test]
     fn a_scalar_has_one_element_and_no_dimension() {

@@ -91,11 +91,10 @@ impl Run {
     /// If the folder holds something else, or cannot be written into.
     pub fn claim(folder: &Path) -> Result<()> {
         fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
-        atomic::clean(folder);
         let entries = fs::read_dir(folder).map_err(|e| Error::io(folder, e))?;
-        let begun = ["config.toml", "log.jsonl", LOCK];
-        let names: Vec<_> = entries.flatten().map(|e| e.file_name()).collect();
-        if names.iter().any(|name| begun.iter().all(|b| name != b)) {
+        // What a run leaves that was killed before its first state.
+        let begun = |name: &str| ["config.toml", "log.jsonl", LOCK].contains(&name) || atomic::is_aside(name);
+        if entries.flatten().any(|entry| !begun(&entry.file_name().to_string_lossy())) {
             let message = "is not empty: give another folder with --out, or go on with --resume";
             return Err(Error::file(folder, message));
         }
@@ -114,6 +113,7 @@ impl Run {
         config.check()?;
         Self::claim(folder)?;
         let lock = lock(folder)?;
+        atomic::clean(folder);
         if start.knows_motion {
             // Pose networks that somebody trained know rotations already.
             (config.rotations.share, config.rotations.keep) = (0.0, 0.0);
@@ -122,6 +122,7 @@ impl Run {
         let trainer = Trainer::of(start.model, start.params, config.plan());
         let run = Run { folder: folder.to_owned(), config, trainer, notes: Notes::default(), _lock: lock };
         run.save()?;
+        run.leave_weights()?;
         Ok(run)
     }
 
@@ -148,7 +149,9 @@ impl Run {
         change(&mut config)?;
         config.check()?;
         let lock = lock(folder)?;
-        atomic::clean(folder.join(CHECKPOINTS));
+        for place in [folder.to_owned(), folder.join(CHECKPOINTS), folder.join("images")] {
+            atomic::clean(place);
+        }
         let mut trainer = Trainer::new(config.model(), config.plan());
         let notes = state::load(&mut trainer, folder, &mut tell)?;
         if config != before {
@@ -195,6 +198,7 @@ impl Run {
                     // All steps before this one are worth keeping, unless their weights are what failed.
                     if self.trainer.steps() > 0 && self.trainer.check_finite().is_ok() {
                         self.save()?;
+                        self.leave_weights()?;
                     }
                     return Err(error);
                 }
@@ -267,7 +271,8 @@ impl Run {
         state::save(&self.trainer, &self.folder, &self.notes)
     }
 
-    /// Leaves weights to predict with where no validation has chosen any yet.
+    /// Leaves weights to predict with where no validation has chosen any yet: those that training starts from, or has
+    /// reached.
     fn leave_weights(&self) -> Result<()> {
         if self.notes.best.is_some() {
             return Ok(());

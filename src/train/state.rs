@@ -85,6 +85,11 @@ pub(super) fn load(trainer: &mut Trainer, folder: &Path, tell: &mut impl FnMut(&
             Ok(mut notes) => {
                 if let Some(error) = first {
                     tell(&format!("{error}; going on from {} at step {}", path.display(), trainer.steps()));
+                    // The next state takes the damaged one's place, not that of the one that is whole.
+                    let state = folder.join(STATE);
+                    if name != STATE && state.exists() {
+                        fs::remove_file(&state).map_err(|e| Error::io(&state, e))?;
+                    }
                 }
                 let beside = fs::read_to_string(folder.join(NOTES)).ok();
                 let dated = beside.and_then(|text| serde_json::from_str::<Dated>(&text).ok());

@@ -81,7 +81,10 @@ impl Run {
             self.notes.before = told("the starting weights", report, tell).map(|r| r.metrics);
         }
         // A training set without depth has no mean map, which is nothing to be told.
-        let map = MeanMap::of_dataset(data.train.as_ref()).ok()?;
+        if (0..data.train.len()).all(|sample| matches!(data.train.depth(sample), Ok(None))) {
+            return None;
+        }
+        let map = told("the mean depth map", MeanMap::of_dataset(data.train.as_ref()), tell)?;
         told("the mean depth map", evaluate_mean_map(&map, test, &samples, DENSE), tell).map(|r| r.metrics)
     }
 

@@ -13,7 +13,20 @@ use crate::nn::Params;
 pub const NETWORKS: [&str; 4] = ["encoder", "depth", "pose_encoder", "pose"];
 
 /// What stands in front of names without meaning anything here.
-const WRAPPERS: [&str; 6] = ["module.", "model.", "state_dict.", "model_state_dict.", "network.", "_orig_mod."];
+const WRAPPERS: [&str; 8] =
+    ["module.", "model.", "models.", "weights.", "state_dict.", "model_state_dict.", "network.", "_orig_mod."];
+
+/// What training programs keep beside the weights: the names begin so.
+const TRAINING: [&str; 8] = [
+    "optimizer.",
+    "optimizers.",
+    "optimizer_states.",
+    "lr_scheduler.",
+    "lr_schedulers.",
+    "scheduler.",
+    "callbacks.",
+    "loops.",
+];
 
 /// What a tensor in a file is.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -40,8 +53,8 @@ pub(super) fn place(name: &str) -> Place {
     if name == "num_batches_tracked" || name.ends_with(".num_batches_tracked") {
         return Place::Useless("counters of batches");
     }
-    if name.starts_with("optimizer.") {
-        return Place::Useless("tensors of an optimizer");
+    if TRAINING.iter().any(|part| name.starts_with(part)) {
+        return Place::Useless("tensors of a training's state");
     }
     if let Some((network, rest)) = own(name) {
         return Place::Model(format!("{network}.{rest}"));

@@ -28,6 +28,18 @@ struct Projection {
     matrix: [f64; 12],
 }
 
+impl Projection {
+    fn read(entries: &Entries, camera: &str) -> Result<Self> {
+        let size = entries.size(&format!("S_rect_{camera}"))?;
+        Ok(Projection { size, matrix: entries.numbers(&format!("P_rect_{camera}"))? })
+    }
+
+    fn intrinsics(&self) -> Intrinsics {
+        let Projection { size: [width, height], matrix: p } = self;
+        Intrinsics { fx: p[0] / width, fy: p[5] / height, cx: p[2] / width, cy: p[6] / height }
+    }
+}
+
 impl Calibration {
     /// Whether the folder of a day has both files.
     pub fn is_in(day: &Path) -> bool {
@@ -39,16 +51,20 @@ impl Calibration {
         day.join(CAMERAS).is_file()
     }
 
+    /// The measured intrinsics of one camera, whatever the file says of the other: `P_rect` over `S_rect`.
+    pub fn intrinsics_of(day: &Path, side: Side) -> Result<Intrinsics> {
+        let entries = Entries::read(day.join(CAMERAS))?;
+        let camera = match side {
+            Side::Left => "02",
+            Side::Right => "03",
+        };
+        Ok(Projection::read(&entries, camera)?.intrinsics())
+    }
+
     /// Reads the files in the folder of a day; that of the LiDAR only `with_lidar`.
     pub fn read(day: &Path, with_lidar: bool) -> Result<Calibration> {
         let cameras = Entries::read(day.join(CAMERAS))?;
-        let projection = |camera: &str| -> Result<Projection> {
-            Ok(Projection {
-                size: cameras.size(&format!("S_rect_{camera}"))?,
-                matrix: cameras.numbers(&format!("P_rect_{camera}"))?,
-            })
-        };
-        let cameras_of_sides = [projection("02")?, projection("03")?];
+        let cameras_of_sides = [Projection::read(&cameras, "02")?, Projection::read(&cameras, "03")?];
         let [width, height] = cameras_of_sides[0].size;
         let lidar_to_rectified = match with_lidar {
             false => None,
@@ -75,8 +91,7 @@ impl Calibration {
 
     /// The measured intrinsics: `P_rect` over `S_rect`.
     pub fn intrinsics(&self, side: Side) -> Intrinsics {
-        let Projection { size: [width, height], matrix: p } = self.camera(side);
-        Intrinsics { fx: p[0] / width, fy: p[5] / height, cx: p[2] / width, cy: p[6] / height }
+        self.camera(side).intrinsics()
     }
 
     /// `P_rect_0c R_rect_00 Tr`, 3x4 row-major: from LiDAR coordinates (metres; x forward, y left, z up) to

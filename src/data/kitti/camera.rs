@@ -108,7 +108,7 @@ impl Camera {
 }
 
 fn calibrated(day: &Path, side: Side) -> Result<(Intrinsics, String)> {
-    let found = Calibration::read(day, false)?.intrinsics(side);
+    let found = Calibration::intrinsics_of(day, side)?;
     Ok((found, day.join(super::calibration::CAMERAS).display().to_string()))
 }
 

@@ -11,19 +11,36 @@ type Result<T> = std::result::Result<T, PthError>;
 impl Pickle<'_> {
     /// The list of dotted names, given each storage's bytes in the order of `storages`.
     pub fn flatten(&self, format: Format, storages: &[Storage]) -> Result<State> {
-        if !matches!(self.root, Value::Object(id) if matches!(self.objects.get(id), Some(Object::Dict(_)))) {
+        let Some(root) = self.names() else {
             return Err(PthError::NotACheckpoint(
                 "it holds no dictionary of names. Save a model's state_dict()".into(),
             ));
-        }
+        };
         let mut stored = 0;
         for claim in &self.storages {
             stored += u128::from(claim.bytes()?);
         }
         let mut flat =
             Flat { pickle: self, storages, entries: Vec::new(), budget: Budget::new(stored), values: 0, text: 0 };
-        flat.visit(&mut String::new(), 0, self.root)?;
+        flat.visit(&mut String::new(), 0, root)?;
         State::new(format, flat.entries)
+    }
+}
+
+impl<'a> Pickle<'a> {
+    fn is_dict(&self, value: Value<'a>) -> bool {
+        matches!(value, Value::Object(id) if matches!(self.objects.get(id), Some(Object::Dict(_))))
+    }
+
+    /// The dictionary of names: the whole, or the only one in a list or tuple, as of (weights, epoch).
+    fn names(&self) -> Option<Value<'a>> {
+        if self.is_dict(self.root) {
+            return Some(self.root);
+        }
+        let Value::Object(id) = self.root else { return None };
+        let Object::Sequence(items) = self.objects.get(id)? else { return None };
+        let mut dicts = items.iter().copied().filter(|item| self.is_dict(*item));
+        dicts.next().filter(|_| dicts.next().is_none())
     }
 }
 
@@ -69,7 +86,9 @@ impl<'a> Flat<'_, 'a> {
                 Plain::Bytes(text.chars().filter_map(|c| u8::try_from(u32::from(c)).ok()).collect())
             }
             Value::Global(Global::DtypeValue(dtype)) => Plain::Text(format!("torch.{}", dtype.name())),
-            Value::Global(_) | Value::Storage(_) => {
+            // A class or function by name, or a number that nothing here could need.
+            Value::Global(_) | Value::Useless => return Ok(()),
+            Value::Storage(_) => {
                 return Err(PthError::damaged(format!(
                     "`{}` is neither a tensor nor a number, string, list or dictionary",
                     shown(path)
@@ -88,12 +107,8 @@ impl<'a> Flat<'_, 'a> {
                             Value::Text(key) => self.child(path, depth, key, *item)?,
                             // An optimizer's state is numbered.
                             Value::Int(key) => self.child(path, depth, &key.to_string(), *item)?,
-                            _ => {
-                                return Err(PthError::damaged(format!(
-                                    "`{}` has a key that is neither a string nor an integer",
-                                    shown(path)
-                                )));
-                            }
+                            // No parameter is called by anything else.
+                            _ => {}
                         }
                     }
                     return Ok(());

@@ -1,6 +1,5 @@
 //! The allow-list: every Python name a pickle may mention. Each stands for something that is made here; none is run.
 
-use super::{PthError, shown};
 use crate::formats::stored::Dtype;
 
 /// Every name a pickle may mention, and what it stands for here.
@@ -13,6 +12,15 @@ pub(super) enum Global {
     Device,
     /// `_codecs.encode`: bytes in protocol 2.
     Encode,
+    /// `collections.Counter` and `defaultdict`: dictionaries with a habit that does not matter here.
+    Dictionary,
+    /// `set`, `frozenset`, `list`, `tuple`: parts in a row.
+    Row,
+    /// `bytearray`.
+    ByteArray,
+    /// Any other name, by its number in the machine's list: it may stand somewhere as a value, which is passed over, but
+    /// not be called.
+    Unknown(usize),
     RebuildTensor,
     RebuildTensorV2,
     RebuildParameter,
@@ -23,10 +31,14 @@ pub(super) enum Global {
     DtypeValue(Dtype),
 }
 
-/// The allow-list. Whatever is not here is refused by name.
-pub(super) fn global(module: &str, name: &str) -> Result<Global, PthError> {
-    let known = match (module, name) {
+/// The allow-list; nothing for a name that is not on it.
+pub(super) fn global(module: &str, name: &str) -> Option<Global> {
+    match (module, name) {
         ("collections", "OrderedDict") => Some(Global::OrderedDict),
+        ("collections", "Counter" | "defaultdict") => Some(Global::Dictionary),
+        ("builtins" | "__builtin__", "set" | "frozenset" | "list" | "tuple") => Some(Global::Row),
+        ("builtins" | "__builtin__", "bytearray") => Some(Global::ByteArray),
+        ("builtins" | "__builtin__", "dict") => Some(Global::Dictionary),
         ("argparse", "Namespace") => Some(Global::Namespace),
         ("torch", "Size") => Some(Global::Size),
         ("torch", "device") => Some(Global::Device),
@@ -45,8 +57,7 @@ pub(super) fn global(module: &str, name: &str) -> Result<Global, PthError> {
             }
         }
         _ => None,
-    };
-    known.ok_or_else(|| PthError::Refused(shown(&format!("{module}.{name}"))))
+    }
 }
 
 /// The number in `FloatStorage` or `FloatTensor`.

@@ -23,6 +23,8 @@ pub(super) enum Value<'a> {
     Bytes(&'a [u8]),
     /// Bytes written as a string with one character for each, as protocol 2 does.
     Latin1(&'a str),
+    /// A value that is of no use here: an integer beyond 16 bytes.
+    Useless,
     /// One of the names that are known.
     Global(Global),
     /// The position in `Pickle::storages`.
@@ -109,6 +111,7 @@ pub(super) fn read(bytes: &[u8]) -> Result<Pickle<'_>> {
         objects: Vec::new(),
         storages: Vec::new(),
         keys: HashMap::new(),
+        unknown: Vec::new(),
     };
     for _ in 0..MAX_INSTRUCTIONS {
         if let Some(root) = machine.step()? {
@@ -117,6 +120,18 @@ pub(super) fn read(bytes: &[u8]) -> Result<Pickle<'_>> {
         }
     }
     Err(PthError::TooLarge(format!("its pickle has more than {MAX_INSTRUCTIONS} instructions")))
+}
+
+/// An integer in two's complement, little end first.
+fn long<'a>(bytes: &[u8]) -> Value<'a> {
+    let mut wide = [0; 16];
+    let Some(low) = wide.get_mut(..bytes.len()) else { return Value::Useless };
+    low.copy_from_slice(bytes);
+    // The last byte's top bit fills the rest.
+    if bytes.last().is_some_and(|b| b & 0x80 != 0) {
+        wide[bytes.len()..].fill(0xff);
+    }
+    Value::Int(i128::from_le_bytes(wide))
 }
 
 struct Machine<'a> {
@@ -130,6 +145,8 @@ struct Machine<'a> {
     storages: Vec<Claim<'a>>,
     /// The storages by key.
     keys: HashMap<&'a str, usize>,
+    /// Names that are not on the allow-list: what a call of them is refused by.
+    unknown: Vec<String>,
 }
 
 impl<'a> Machine<'a> {
@@ -176,17 +193,11 @@ impl<'a> Machine<'a> {
                 let bytes = self.array()?;
                 self.stack.push(Value::Int(i128::from(u16::from_le_bytes(bytes))));
             }
-            0x8a => {
-                let length = usize::from(self.byte()?);
+            // LONG4 has the longer length.
+            0x8a | 0x8b => {
+                let length = self.length(if opcode == 0x8a { 1 } else { 4 })?;
                 let bytes = self.take(length)?;
-                if length > 16 {
-                    return Err(self.bad(format!("an integer of {length} bytes")));
-                }
-                // Two's complement: the last byte's top bit fills the rest.
-                let fill = if bytes.last().is_some_and(|b| b & 0x80 != 0) { 0xff } else { 0 };
-                let mut wide = [fill; 16];
-                wide[..length].copy_from_slice(bytes);
-                self.stack.push(Value::Int(i128::from_le_bytes(wide)));
+                self.stack.push(long(bytes));
             }
             b'G' => {
                 let bytes = self.array()?;
@@ -221,11 +232,18 @@ impl<'a> Machine<'a> {
                 self.stack.push(Value::Bytes(bytes));
             }
 
-            // EMPTY_TUPLE, EMPTY_LIST, EMPTY_DICT
-            b')' | b']' => self.push_object(Object::Sequence(Vec::new())),
+            // BYTEARRAY8
+            0x96 => {
+                let length = self.length(8)?;
+                let bytes = self.take(length)?;
+                self.stack.push(Value::Bytes(bytes));
+            }
+
+            // EMPTY_TUPLE, EMPTY_LIST, EMPTY_SET, EMPTY_DICT
+            b')' | b']' | 0x8f => self.push_object(Object::Sequence(Vec::new())),
             b'}' => self.push_object(Object::Dict(Dict::new(Vec::new()))),
-            // TUPLE, TUPLE1, TUPLE2, TUPLE3
-            b't' => {
+            // TUPLE, FROZENSET, TUPLE1, TUPLE2, TUPLE3
+            b't' | 0x91 => {
                 let items = self.pop_mark()?;
                 self.push_object(Object::Sequence(items));
             }
@@ -237,9 +255,9 @@ impl<'a> Machine<'a> {
                 items.reverse();
                 self.push_object(Object::Sequence(items));
             }
-            // APPEND, APPENDS
-            b'a' | b'e' => {
-                let items = if opcode == b'e' { self.pop_mark()? } else { vec![self.pop()?] };
+            // APPEND, APPENDS, ADDITEMS
+            b'a' | b'e' | 0x90 => {
+                let items = if opcode == b'a' { vec![self.pop()?] } else { self.pop_mark()? };
                 match self.top_object()? {
                     Object::Sequence(list) => list.extend(items),
                     _ => return Err(self.bad("it appends to something that is not a list")),
@@ -286,15 +304,22 @@ impl<'a> Machine<'a> {
             b'c' | b'i' => {
                 let module = self.line()?;
                 let name = self.line()?;
-                let known = global(module, name)?;
+                let found = self.global(module, name);
                 if opcode == b'i' {
-                    return Err(self.bad("opcode INST, which torch.save does not write"));
+                    // A call, of whatever it names.
+                    return Err(match found {
+                        Global::Unknown(which) => self.refused(which),
+                        _ => self.bad("opcode INST, which torch.save does not write"),
+                    });
                 }
-                self.stack.push(Value::Global(known));
+                self.stack.push(Value::Global(found));
             }
             // STACK_GLOBAL
             0x93 => match (self.pop()?, self.pop()?) {
-                (Value::Text(name), Value::Text(module)) => self.stack.push(Value::Global(global(module, name)?)),
+                (Value::Text(name), Value::Text(module)) => {
+                    let found = self.global(module, name);
+                    self.stack.push(Value::Global(found));
+                }
                 _ => return Err(self.bad("a global whose name is not a string")),
             },
             // REDUCE, NEWOBJ, BUILD
@@ -306,7 +331,7 @@ impl<'a> Machine<'a> {
             0x81 => {
                 let (arguments, class) = self.pop_call()?;
                 match class {
-                    Global::OrderedDict if arguments.is_empty() => {
+                    Global::OrderedDict | Global::Dictionary if arguments.is_empty() => {
                         self.push_object(Object::Dict(Dict::new(Vec::new())))
                     }
                     Global::Namespace if arguments.is_empty() => {
@@ -451,11 +476,27 @@ impl<'a> Machine<'a> {
         let Value::Global(callee) = callee else {
             return Err(self.bad("it calls something that is not a name"));
         };
+        if let Global::Unknown(which) = callee {
+            return Err(self.refused(which));
+        }
         match self.sequence(arguments) {
             Some(items) if items.len() <= 8 => Ok((items.to_vec(), callee)),
             Some(items) => Err(self.bad(format!("it calls {callee:?} with {} arguments", items.len()))),
             None => Err(self.bad(format!("it calls {callee:?} with something that is not a tuple"))),
         }
+    }
+
+    /// A name, known or not.
+    fn global(&mut self, module: &str, name: &str) -> Global {
+        global(module, name).unwrap_or_else(|| {
+            self.unknown.push(shown(&format!("{module}.{name}")));
+            Global::Unknown(self.unknown.len() - 1)
+        })
+    }
+
+    /// The error of calling a name that is not on the allow-list.
+    fn refused(&self, which: usize) -> PthError {
+        PthError::Refused(self.unknown.get(which).cloned().unwrap_or_default())
     }
 
     /// What calling one of the known names gives.
@@ -476,6 +517,21 @@ impl<'a> Machine<'a> {
                 }
                 Ok(self.add(Object::Dict(Dict::new(items))))
             }
+            // A Counter's only argument is a dictionary; a defaultdict's, what makes its defaults.
+            (Global::Dictionary, [] | [Value::Global(_) | Value::None]) => {
+                Ok(self.add(Object::Dict(Dict::new(Vec::new()))))
+            }
+            (Global::Dictionary, [items]) => match self.take_over(*items) {
+                Some(Object::Dict(dict)) => Ok(self.add(Object::Dict(dict))),
+                _ => Err(self.bad("a dictionary of something that is none")),
+            },
+            (Global::Row, []) => Ok(self.add(Object::Sequence(Vec::new()))),
+            (Global::Row, [items]) if self.sequence(*items).is_some() => Ok(*items),
+            (Global::ByteArray, []) => Ok(Value::Bytes(&[])),
+            (
+                Global::ByteArray,
+                [bytes @ (Value::Bytes(_) | Value::Latin1(_) | Value::Text(_))] | [bytes, Value::Text(_)],
+            ) => Ok(*bytes),
             (Global::Size, [sizes]) if self.sequence(*sizes).is_some() => Ok(*sizes),
             (Global::Device, [Value::Text(name)] | [Value::Text(name), Value::Int(_)]) => Ok(Value::Text(name)),
             (Global::Encode, [Value::Text(text), Value::Text("latin1" | "latin-1")]) => {

@@ -53,9 +53,15 @@ impl State {
     /// Takes the entries over; two with one name are an error.
     pub(super) fn new(format: Format, entries: Vec<(String, Item)>) -> Result<Self, PthError> {
         let mut index = HashMap::with_capacity(entries.len());
-        for (i, (name, _)) in entries.iter().enumerate() {
-            if index.insert(name.clone(), i).is_some() {
-                return Err(PthError::Duplicate(shown(name)));
+        for (i, (name, item)) in entries.iter().enumerate() {
+            // A number or string that stands twice (`{"a.b": 1, "a": {"b": 2}}`) is nobody's weight.
+            let first: Option<&usize> = index.get(name);
+            match (first.map(|&first| &entries[first].1), item) {
+                (Some(Item::Tensor(_)), Item::Tensor(_)) => return Err(PthError::Duplicate(shown(name))),
+                (Some(Item::Tensor(_)) | Some(Item::Plain(_)), Item::Plain(_)) => {}
+                (Some(Item::Plain(_)), Item::Tensor(_)) | (None, _) => {
+                    index.insert(name.clone(), i);
+                }
             }
         }
         Ok(State { format, entries, index })

@@ -1,6 +1,7 @@
 //! Elements chosen along an axis, each by an index of its own.
 
 use crate::ops::support::indices;
+use crate::ops::support::indices::countable;
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 
@@ -30,6 +31,7 @@ impl<T: Float> Op<T> for Gather {
         if self.axis >= x.rank() {
             return Err(ShapeError::new(format!("no dimension {}", self.axis)));
         }
+        countable::<T>(x.dims()[self.axis])?;
         if !fits(&index, &x, self.axis) {
             return Err(ShapeError::new(format!("the index does not fit into x beside dimension {}", self.axis)));
         }

@@ -2,6 +2,7 @@
 
 use crate::ops::reduce::sum::cut;
 use crate::ops::support::indices;
+use crate::ops::support::indices::countable;
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply1};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
@@ -24,6 +25,7 @@ impl<T: Float> Op<T> for IndexSelect {
         if self.axis >= x.rank() {
             return Err(ShapeError::new(format!("no dimension {}", self.axis)));
         }
+        countable::<T>(x.dims()[self.axis])?;
         match index.dims() {
             &[k] => Ok(vec![x.with(self.axis, k)]),
             _ => Err(ShapeError::new("expected an index of one dimension")),

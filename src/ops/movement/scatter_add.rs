@@ -2,6 +2,7 @@
 
 use super::gather::fits;
 use crate::ops::support::indices;
+use crate::ops::support::indices::countable;
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply1};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 
@@ -26,6 +27,7 @@ impl<T: Float> Op<T> for ScatterAdd {
         if self.axis >= x.rank() {
             return Err(ShapeError::new(format!("no dimension {}", self.axis)));
         }
+        countable::<T>(x.dims()[self.axis])?;
         if !fits(&index, &x, self.axis) {
             return Err(ShapeError::new(format!("the index does not fit into x beside dimension {}", self.axis)));
         }

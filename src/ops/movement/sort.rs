@@ -4,6 +4,7 @@ use std::cmp::Ordering;
 
 use crate::ops::reduce::sum::cut;
 use crate::ops::support::indices;
+use crate::ops::support::indices::countable;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
@@ -72,6 +73,7 @@ impl<T: Float> Op<T> for Sort {
         if self.axis >= inputs[0].rank() {
             return Err(ShapeError::new(format!("no dimension {}", self.axis)));
         }
+        countable::<T>(inputs[0].dims()[self.axis])?;
         Ok(vec![inputs[0]; 2])
     }
 

@@ -2,6 +2,7 @@
 
 use super::sort::{compare, leading};
 use crate::ops::support::indices;
+use crate::ops::support::indices::countable;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 
@@ -26,7 +27,10 @@ impl<T: Float> Op<T> for TopK {
 
     fn shape(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError> {
         match inputs[0].dims().get(self.axis) {
-            Some(&n) if self.k <= n => Ok(vec![inputs[0].with(self.axis, self.k); 2]),
+            Some(&n) if self.k <= n => {
+                countable::<T>(n)?;
+                Ok(vec![inputs[0].with(self.axis, self.k); 2])
+            }
             Some(n) => Err(ShapeError::new(format!("no {} of {n} elements", self.k))),
             None => Err(ShapeError::new(format!("no dimension {}", self.axis))),
         }

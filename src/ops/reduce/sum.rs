@@ -1,5 +1,6 @@
 //! Sums, means and extremes along dimensions.
 
+use crate::ops::support::indices::countable;
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply, apply1};
 use crate::tensor::pool::Buffer;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
@@ -248,9 +249,11 @@ where
 
     fn shape(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError> {
         let shape = dropped(&inputs[0], self.first, self.count)?[0];
-        if cut(&inputs[0], self.first, self.count)[1] == 0 {
+        let run = cut(&inputs[0], self.first, self.count)[1];
+        if run == 0 {
             return Err(ShapeError::new("nothing has no extreme"));
         }
+        countable::<T>(run)?;
         Ok(vec![shape, shape])
     }
 

@@ -3,8 +3,21 @@
 //! They are numbers of the same type as the data, so that an op's inputs and outputs are all alike; in `f32` they are
 //! exact up to 2^24. Nobody differentiates them.
 
+use crate::ops::ShapeError;
 use crate::tensor::shape::MAX_RANK;
 use crate::tensor::{Accum, Float, Shape, Tensor};
+
+/// Whether all indices along an axis of this extent can be told apart as numbers of this type: whole numbers are exact up
+/// to 2^24 in `f32`, and to 2^53 in `f64`.
+pub(in crate::ops) fn countable<T: Float>(extent: usize) -> Result<(), ShapeError> {
+    let exact = 2.0 / T::EPSILON.f64();
+    if extent as f64 <= exact {
+        return Ok(());
+    }
+    Err(ShapeError::new(format!(
+        "{extent} elements are more than the indices of this element type count exactly ({exact})"
+    )))
+}
 
 /// Panics unless every index is a whole number below `extent`.
 pub(in crate::ops) fn check<T: Float>(op: &str, index: &Tensor<T>, extent: usize) {
@@ -82,6 +95,24 @@ mod tests {
         let index = Tensor::from_vec([2, 2], vec![2.0f32, 0.0, 1.0, 1.0]);
         assert_eq!(pointed(&index, &[3, 4].into(), 0).collect::<Vec<_>>(), [8, 1, 4, 5]);
         assert_eq!(pointed(&index, &[3, 4].into(), 1).collect::<Vec<_>>(), [2, 0, 5, 5]);
+    }
+
+    #[test]
+    fn axes_longer_than_exact_whole_numbers_are_refused() {
+        assert!(countable::<f32>(1 << 24).is_ok() && countable::<f32>((1 << 24) + 1).is_err());
+        assert!(countable::<f64>((1 << 24) + 1).is_ok());
+        let long = Shape::new(&[(1 << 24) + 1, 1]);
+        let one = Shape::new(&[1]);
+        let refused =
+            |found: Result<Vec<Shape>, ShapeError>| found.is_err_and(|e| e.to_string().contains("count exactly"));
+        use crate::ops::Op;
+        use crate::ops::movement::{gather::Gather, index_select::IndexSelect, sort::Sort, top_k::TopK};
+        use crate::ops::reduce::sum::{Extreme, Max};
+        assert!(refused(Op::<f32>::shape(&Sort { axis: 0, descending: false }, &[long])));
+        assert!(refused(Op::<f32>::shape(&TopK { axis: 0, k: 1, largest: true }, &[long])));
+        assert!(refused(Op::<f32>::shape(&IndexSelect { axis: 0 }, &[long, one])));
+        assert!(refused(Op::<f32>::shape(&Gather { axis: 0 }, &[long, Shape::new(&[1, 1])])));
+        assert!(refused(Op::<f32>::shape(&Extreme { first: 0, count: 1, side: Max }, &[long])));
     }
 
     #[test]
