@@ -599,7 +599,7 @@ fn what_stands_beside_the_weights_never_blocks_a_file() {
         if path.extension().is_none_or(|ending| ending != "pth") {
             continue;
         }
-        let weights = weights::load(&[path.clone()], Need::Only("pose"), false);
+        let weights = parallax::weights::load(std::slice::from_ref(&path), Need::Only("pose"), false);
         let weights = weights.unwrap_or_else(|e| panic!("{e}"));
         let found = weights.params.export();
         for (name, tensor) in &expected {

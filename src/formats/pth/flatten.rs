@@ -12,6 +12,10 @@ impl Pickle<'_> {
     /// The list of dotted names, given each storage's bytes in the order of `storages`.
     pub fn flatten(&self, format: Format, storages: &[Storage]) -> Result<State> {
         let Some(root) = self.names() else {
+            // A whole model, pickled as the object that it was.
+            if let Value::Unread(which) = self.root {
+                return Err(PthError::Refused(self.name_of(which)));
+            }
             return Err(PthError::NotACheckpoint(
                 "it holds no dictionary of names. Save a model's state_dict()".into(),
             ));
@@ -23,7 +27,21 @@ impl Pickle<'_> {
         let mut flat =
             Flat { pickle: self, storages, entries: Vec::new(), budget: Budget::new(stored), values: 0, text: 0 };
         flat.visit(&mut String::new(), 0, root)?;
+        let unread = flat.entries.iter().find_map(|(_, item)| match item {
+            Item::Plain(Plain::Unread(name)) => Some(name.clone()),
+            _ => None,
+        });
+        if let Some(name) = unread
+            && !flat.entries.iter().any(|(_, item)| matches!(item, Item::Tensor(_)))
+        {
+            return Err(PthError::Refused(name));
+        }
         State::new(format, flat.entries)
+    }
+
+    /// A name that is not on the allow-list.
+    fn name_of(&self, which: usize) -> String {
+        self.unknown.get(which).map(|unknown| unknown.name.clone()).unwrap_or_default()
     }
 }
 
@@ -86,6 +104,11 @@ impl<'a> Flat<'_, 'a> {
                 Plain::Bytes(text.chars().filter_map(|c| u8::try_from(u32::from(c)).ok()).collect())
             }
             Value::Global(Global::DtypeValue(dtype)) => Plain::Text(format!("torch.{}", dtype.name())),
+            Value::Unread(which) => {
+                let name = pickle.name_of(which);
+                self.count(name.len())?;
+                Plain::Unread(name)
+            }
             // A class or function by name, or a number that nothing here could need.
             Value::Global(_) | Value::Useless => return Ok(()),
             Value::Storage(_) => {

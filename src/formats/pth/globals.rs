@@ -1,8 +1,8 @@
-//! The allow-list: every Python name a pickle may mention. Each stands for something that is made here; none is run.
+//! The Python names that mean something here. Each stands for something that is made here; none is run.
 
 use crate::formats::stored::Dtype;
 
-/// Every name a pickle may mention, and what it stands for here.
+/// A name that a pickle mentions, and what it stands for here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Global {
     OrderedDict,
@@ -18,8 +18,8 @@ pub(super) enum Global {
     Row,
     /// `bytearray`.
     ByteArray,
-    /// Any other name, by its number in the machine's list: it may stand somewhere as a value, which is passed over, but
-    /// not be called.
+    /// Any other name, by its number in the machine's list. It may stand somewhere as a value and be called: both are
+    /// passed over.
     Unknown(usize),
     RebuildTensor,
     RebuildTensorV2,
@@ -57,6 +57,26 @@ pub(super) fn global(module: &str, name: &str) -> Option<Global> {
             }
         }
         _ => None,
+    }
+}
+
+/// Whether calling that name could run a program or code. Nothing would be run here either, but whoever put such a call
+/// into a file of weights meant harm.
+pub(super) fn runs_programs(module: &str, name: &str) -> bool {
+    const MODULES: [&str; 24] = [
+        "asyncio", "bdb", "code", "commands", "ctypes", "importlib", "multiprocessing", "nt", "operator", "os", "pdb",
+        "pip", "pkgutil", "posix", "pty", "runpy", "shutil", "socket", "subprocess", "sys", "timeit", "torch.hub",
+        "urllib", "webbrowser",
+    ];
+    const BUILTINS: [&str; 12] = [
+        "__import__", "apply", "breakpoint", "compile", "delattr", "eval", "exec", "execfile", "getattr", "input", "open",
+        "setattr",
+    ];
+    let under = |root: &str| module.strip_prefix(root).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'));
+    match module {
+        "builtins" | "__builtin__" => BUILTINS.contains(&name.split('.').next().unwrap_or(name)),
+        "torch" => matches!(name, "load" | "compile"),
+        _ => MODULES.iter().any(|root| under(root)),
     }
 }
 

@@ -6,7 +6,7 @@
 
 use std::collections::HashMap;
 
-use super::globals::{Global, global};
+use super::globals::{Global, global, runs_programs};
 use super::{MAX_INSTRUCTIONS, MAX_PICKLE, MAX_RANK, PthError, shown};
 use crate::formats::stored::Dtype;
 
@@ -25,6 +25,9 @@ pub(super) enum Value<'a> {
     Latin1(&'a str),
     /// A value that is of no use here: an integer beyond 16 bytes.
     Useless,
+    /// What calling a name that is not known would give: its number in `Pickle::unknown`. Nothing is called; whatever
+    /// Python would do with the result is passed over.
+    Unread(usize),
     /// One of the names that are known.
     Global(Global),
     /// The position in `Pickle::storages`.
@@ -88,12 +91,23 @@ impl Claim<'_> {
     }
 }
 
+/// A name that is not on the allow-list.
+#[derive(Debug)]
+pub(super) struct Unknown {
+    /// Module and name, fit to be shown.
+    pub name: String,
+    /// Whether calling it could run a program.
+    runs: bool,
+}
+
 /// What one pickle built.
 pub(super) struct Pickle<'a> {
     pub root: Value<'a>,
     pub objects: Vec<Object<'a>>,
     /// The storages its tensors refer to.
     pub storages: Vec<Claim<'a>>,
+    /// The names it mentions that are not on the allow-list.
+    pub unknown: Vec<Unknown>,
     /// Where it ended.
     pub length: usize,
 }
@@ -115,8 +129,8 @@ pub(super) fn read(bytes: &[u8]) -> Result<Pickle<'_>> {
     };
     for _ in 0..MAX_INSTRUCTIONS {
         if let Some(root) = machine.step()? {
-            let Machine { objects, storages, at, .. } = machine;
-            return Ok(Pickle { root, objects, storages, length: at });
+            let Machine { objects, storages, unknown, at, .. } = machine;
+            return Ok(Pickle { root, objects, storages, unknown, length: at });
         }
     }
     Err(PthError::TooLarge(format!("its pickle has more than {MAX_INSTRUCTIONS} instructions")))
@@ -145,8 +159,7 @@ struct Machine<'a> {
     storages: Vec<Claim<'a>>,
     /// The storages by key.
     keys: HashMap<&'a str, usize>,
-    /// Names that are not on the allow-list: what a call of them is refused by.
-    unknown: Vec<String>,
+    unknown: Vec<Unknown>,
 }
 
 impl<'a> Machine<'a> {
@@ -175,187 +188,177 @@ impl<'a> Machine<'a> {
             }
             // MARK
             b'(' => self.marks.push(self.stack.len()),
-
-            // NONE, NEWTRUE, NEWFALSE
-            b'N' => self.stack.push(Value::None),
-            0x88 => self.stack.push(Value::Bool(true)),
-            0x89 => self.stack.push(Value::Bool(false)),
-            // BININT, BININT1, BININT2, LONG1, BINFLOAT
-            b'J' => {
-                let bytes = self.array()?;
-                self.stack.push(Value::Int(i128::from(i32::from_le_bytes(bytes))));
+            b'N' | 0x88 | 0x89 | b'J' | b'K' | b'M' | 0x8a | 0x8b | b'G' => {
+                let number = self.number(opcode)?;
+                self.stack.push(number);
             }
-            b'K' => {
-                let byte = self.byte()?;
-                self.stack.push(Value::Int(i128::from(byte)));
+            b'X' | 0x8c | 0x8d | b'U' | b'T' | b'C' | b'B' | 0x8e | 0x96 => {
+                let text = self.text(opcode)?;
+                self.stack.push(text);
             }
-            b'M' => {
-                let bytes = self.array()?;
-                self.stack.push(Value::Int(i128::from(u16::from_le_bytes(bytes))));
-            }
-            // LONG4 has the longer length.
-            0x8a | 0x8b => {
-                let length = self.length(if opcode == 0x8a { 1 } else { 4 })?;
-                let bytes = self.take(length)?;
-                self.stack.push(long(bytes));
-            }
-            b'G' => {
-                let bytes = self.array()?;
-                self.stack.push(Value::Float(f64::from_be_bytes(bytes)));
-            }
-
-            // BINUNICODE, SHORT_BINUNICODE, BINUNICODE8
-            b'X' | 0x8c | 0x8d => {
-                let length = self.length(match opcode {
-                    b'X' => 4,
-                    0x8c => 1,
-                    _ => 8,
-                })?;
-                let bytes = self.take(length)?;
-                let text = str::from_utf8(bytes).map_err(|_| self.bad("a string that is not UTF-8"))?;
-                self.stack.push(Value::Text(text));
-            }
-            // SHORT_BINSTRING, BINSTRING: Python 2's strings, which may be names.
-            b'U' | b'T' => {
-                let length = self.length(if opcode == b'U' { 1 } else { 4 })?;
-                let bytes = self.take(length)?;
-                self.stack.push(str::from_utf8(bytes).map_or(Value::Bytes(bytes), Value::Text));
-            }
-            // SHORT_BINBYTES, BINBYTES, BINBYTES8
-            b'C' | b'B' | 0x8e => {
-                let length = self.length(match opcode {
-                    b'C' => 1,
-                    b'B' => 4,
-                    _ => 8,
-                })?;
-                let bytes = self.take(length)?;
-                self.stack.push(Value::Bytes(bytes));
-            }
-
-            // BYTEARRAY8
-            0x96 => {
-                let length = self.length(8)?;
-                let bytes = self.take(length)?;
-                self.stack.push(Value::Bytes(bytes));
-            }
-
-            // EMPTY_TUPLE, EMPTY_LIST, EMPTY_SET, EMPTY_DICT
-            b')' | b']' | 0x8f => self.push_object(Object::Sequence(Vec::new())),
-            b'}' => self.push_object(Object::Dict(Dict::new(Vec::new()))),
-            // TUPLE, FROZENSET, TUPLE1, TUPLE2, TUPLE3
-            b't' | 0x91 => {
-                let items = self.pop_mark()?;
-                self.push_object(Object::Sequence(items));
-            }
-            0x85..=0x87 => {
-                let mut items = Vec::with_capacity(3);
-                for _ in 0..opcode - 0x84 {
-                    items.push(self.pop()?);
-                }
-                items.reverse();
-                self.push_object(Object::Sequence(items));
-            }
-            // APPEND, APPENDS, ADDITEMS
-            b'a' | b'e' | 0x90 => {
-                let items = if opcode == b'a' { vec![self.pop()?] } else { self.pop_mark()? };
-                match self.top_object()? {
-                    Object::Sequence(list) => list.extend(items),
-                    _ => return Err(self.bad("it appends to something that is not a list")),
-                }
-            }
-            // SETITEM, SETITEMS
-            b's' | b'u' => {
-                let items = if opcode == b'u' {
-                    self.pop_mark()?
-                } else {
-                    let value = self.pop()?;
-                    vec![self.pop()?, value]
-                };
-                let (pairs, rest) = items.as_chunks::<2>();
-                let complete = rest.is_empty();
-                match self.top_object()? {
-                    Object::Dict(dict) if complete => {
-                        dict.items.extend(pairs.iter().map(|[key, value]| (*key, *value)))
-                    }
-                    _ => return Err(self.bad("it sets items of something that is not a dictionary")),
-                }
-            }
-
-            // BINPUT, LONG_BINPUT, MEMOIZE
-            b'q' | b'r' | 0x94 => {
-                let slot = match opcode {
-                    b'q' => u32::from(self.byte()?),
-                    b'r' => u32::from_le_bytes(self.array()?),
-                    _ => u32::try_from(self.memo.len()).unwrap_or(u32::MAX),
-                };
-                let value = self.top()?;
-                self.memo.insert(slot, value);
-            }
-            // BINGET, LONG_BINGET
-            b'h' | b'j' => {
-                let slot = if opcode == b'h' { u32::from(self.byte()?) } else { u32::from_le_bytes(self.array()?) };
-                match self.memo.get(&slot) {
-                    Some(value) => self.stack.push(*value),
-                    None => return Err(self.bad(format!("memo {slot} is read before it is set"))),
-                }
-            }
-
-            // GLOBAL, and INST (never written by torch.save, but its name is worth telling)
-            b'c' | b'i' => {
-                let module = self.line()?;
-                let name = self.line()?;
-                let found = self.global(module, name);
-                if opcode == b'i' {
-                    // A call, of whatever it names.
-                    return Err(match found {
-                        Global::Unknown(which) => self.refused(which),
-                        _ => self.bad("opcode INST, which torch.save does not write"),
-                    });
-                }
-                self.stack.push(Value::Global(found));
-            }
-            // STACK_GLOBAL
-            0x93 => match (self.pop()?, self.pop()?) {
-                (Value::Text(name), Value::Text(module)) => {
-                    let found = self.global(module, name);
-                    self.stack.push(Value::Global(found));
-                }
-                _ => return Err(self.bad("a global whose name is not a string")),
-            },
-            // REDUCE, NEWOBJ, BUILD
-            b'R' => {
-                let (arguments, callee) = self.pop_call()?;
-                let made = self.reduce(callee, arguments)?;
-                self.stack.push(made);
-            }
-            0x81 => {
-                let (arguments, class) = self.pop_call()?;
-                match class {
-                    Global::OrderedDict | Global::Dictionary if arguments.is_empty() => {
-                        self.push_object(Object::Dict(Dict::new(Vec::new())))
-                    }
-                    Global::Namespace if arguments.is_empty() => {
-                        self.push_object(Object::Dict(Dict { items: Vec::new(), attributes_count: true }));
-                    }
-                    Global::Parameter | Global::TensorClass if arguments.is_empty() => {
-                        self.push_object(Object::Blank(class));
-                    }
-                    _ => return Err(self.bad(format!("it makes a new {class:?} from {} values", arguments.len()))),
-                }
-            }
-            b'b' => self.build()?,
-            // BINPERSID
-            b'Q' => {
-                let id = self.pop()?;
-                let storage = self.storage(id)?;
-                self.stack.push(Value::Storage(storage));
-            }
-
+            b')' | b']' | 0x8f | b'}' | b't' | 0x91 | 0x85..=0x87 => self.container(opcode)?,
+            b'a' | b'e' | 0x90 | b's' | b'u' => self.fill(opcode)?,
+            b'q' | b'r' | 0x94 | b'h' | b'j' => self.remember(opcode)?,
+            b'c' | b'i' | 0x93 => self.name(opcode)?,
+            b'R' | 0x81 | b'b' | b'Q' => self.call(opcode)?,
             other => {
                 return Err(self.bad(format!("opcode 0x{other:02x}, which torch.save does not write")));
             }
         }
         Ok(None)
+    }
+
+    /// NONE, NEWTRUE, NEWFALSE, BININT, BININT1, BININT2, LONG1, LONG4, BINFLOAT: a value that is a number or like one.
+    fn number(&mut self, opcode: u8) -> Result<Value<'a>> {
+        Ok(match opcode {
+            b'N' => Value::None,
+            0x88 => Value::Bool(true),
+            0x89 => Value::Bool(false),
+            b'J' => Value::Int(i128::from(i32::from_le_bytes(self.array()?))),
+            b'K' => Value::Int(i128::from(self.byte()?)),
+            b'M' => Value::Int(i128::from(u16::from_le_bytes(self.array()?))),
+            0x8a | 0x8b => {
+                let length = self.length(if opcode == 0x8a { 1 } else { 4 })?;
+                long(self.take(length)?)
+            }
+            _ => Value::Float(f64::from_be_bytes(self.array()?)),
+        })
+    }
+
+    /// The strings (BINUNICODE, SHORT_BINUNICODE, BINUNICODE8), Python 2's strings, which may be names (SHORT_BINSTRING,
+    /// BINSTRING), and the bytes (SHORT_BINBYTES, BINBYTES, BINBYTES8, BYTEARRAY8).
+    fn text(&mut self, opcode: u8) -> Result<Value<'a>> {
+        let length = self.length(match opcode {
+            0x8c | b'U' | b'C' => 1,
+            b'X' | b'T' | b'B' => 4,
+            _ => 8,
+        })?;
+        let bytes = self.take(length)?;
+        match opcode {
+            b'X' | 0x8c | 0x8d => {
+                str::from_utf8(bytes).map(Value::Text).map_err(|_| self.bad("a string that is not UTF-8"))
+            }
+            b'U' | b'T' => Ok(str::from_utf8(bytes).map_or(Value::Bytes(bytes), Value::Text)),
+            _ => Ok(Value::Bytes(bytes)),
+        }
+    }
+
+    /// EMPTY_TUPLE, EMPTY_LIST, EMPTY_SET, EMPTY_DICT, and what takes its parts from the stack: TUPLE, FROZENSET, TUPLE1,
+    /// TUPLE2, TUPLE3.
+    fn container(&mut self, opcode: u8) -> Result<()> {
+        let object = match opcode {
+            b')' | b']' | 0x8f => Object::Sequence(Vec::new()),
+            b'}' => Object::Dict(Dict::new(Vec::new())),
+            b't' | 0x91 => Object::Sequence(self.pop_mark()?),
+            _ => {
+                let mut items = Vec::with_capacity(3);
+                for _ in 0..opcode - 0x84 {
+                    items.push(self.pop()?);
+                }
+                items.reverse();
+                Object::Sequence(items)
+            }
+        };
+        self.push_object(object);
+        Ok(())
+    }
+
+    /// APPEND, APPENDS, ADDITEMS; SETITEM, SETITEMS: parts added to the object on top of the stack.
+    fn fill(&mut self, opcode: u8) -> Result<()> {
+        let items = match opcode {
+            b'a' => vec![self.pop()?],
+            b's' => {
+                let value = self.pop()?;
+                vec![self.pop()?, value]
+            }
+            _ => self.pop_mark()?,
+        };
+        if let Value::Unread(_) = self.top()? {
+            return Ok(());
+        }
+        if matches!(opcode, b'a' | b'e' | 0x90) {
+            return match self.top_object()? {
+                Object::Sequence(list) => {
+                    list.extend(items);
+                    Ok(())
+                }
+                _ => Err(self.bad("it appends to something that is not a list")),
+            };
+        }
+        let (pairs, rest) = items.as_chunks::<2>();
+        match self.top_object()? {
+            Object::Dict(dict) if rest.is_empty() => {
+                dict.items.extend(pairs.iter().map(|[key, value]| (*key, *value)));
+                Ok(())
+            }
+            _ => Err(self.bad("it sets items of something that is not a dictionary")),
+        }
+    }
+
+    /// BINPUT, LONG_BINPUT, MEMOIZE; BINGET, LONG_BINGET: into the memo and out of it.
+    fn remember(&mut self, opcode: u8) -> Result<()> {
+        let slot = match opcode {
+            b'q' | b'h' => u32::from(self.byte()?),
+            b'r' | b'j' => u32::from_le_bytes(self.array()?),
+            _ => u32::try_from(self.memo.len()).unwrap_or(u32::MAX),
+        };
+        if matches!(opcode, b'h' | b'j') {
+            let Some(value) = self.memo.get(&slot) else {
+                return Err(self.bad(format!("memo {slot} is read before it is set")));
+            };
+            self.stack.push(*value);
+        } else {
+            let value = self.top()?;
+            self.memo.insert(slot, value);
+        }
+        Ok(())
+    }
+
+    /// GLOBAL, STACK_GLOBAL: a name; INST: a call of one, never written by torch.save, but its name is worth telling.
+    fn name(&mut self, opcode: u8) -> Result<()> {
+        let (module, name) = if opcode == 0x93 {
+            match (self.pop()?, self.pop()?) {
+                (Value::Text(name), Value::Text(module)) => (module, name),
+                _ => return Err(self.bad("a global whose name is not a string")),
+            }
+        } else {
+            (self.line()?, self.line()?)
+        };
+        let found = self.global(module, name);
+        if opcode == b'i' {
+            return Err(match found {
+                Global::Unknown(which) => PthError::Refused(self.unknown[which].name.clone()),
+                _ => self.bad("opcode INST, which torch.save does not write"),
+            });
+        }
+        self.stack.push(Value::Global(found));
+        Ok(())
+    }
+
+    /// REDUCE, NEWOBJ, BUILD, BINPERSID: what Python would make by a call.
+    fn call(&mut self, opcode: u8) -> Result<()> {
+        let made = match opcode {
+            b'R' | 0x81 => {
+                let arguments = self.pop()?;
+                let callee = self.pop()?;
+                let Value::Global(callee) = callee else {
+                    return Err(self.bad("it calls something that is not a name"));
+                };
+                if let Global::Unknown(which) = callee {
+                    self.unread(which)?
+                } else {
+                    let arguments = self.arguments(callee, arguments)?;
+                    if opcode == b'R' { self.reduce(callee, arguments)? } else { self.instance(callee, &arguments)? }
+                }
+            }
+            b'b' => return self.build(),
+            _ => {
+                let id = self.pop()?;
+                self.storage(id)?
+            }
+        };
+        self.stack.push(made);
+        Ok(())
     }
 
     /// An error at this place of the pickle.
@@ -469,18 +472,10 @@ impl<'a> Machine<'a> {
         }
     }
 
-    /// The arguments of a call and the name that is called.
-    fn pop_call(&mut self) -> Result<(Vec<Value<'a>>, Global)> {
-        let arguments = self.pop()?;
-        let callee = self.pop()?;
-        let Value::Global(callee) = callee else {
-            return Err(self.bad("it calls something that is not a name"));
-        };
-        if let Global::Unknown(which) = callee {
-            return Err(self.refused(which));
-        }
+    /// The arguments of a call of a known name.
+    fn arguments(&self, callee: Global, arguments: Value<'a>) -> Result<Vec<Value<'a>>> {
         match self.sequence(arguments) {
-            Some(items) if items.len() <= 8 => Ok((items.to_vec(), callee)),
+            Some(items) if items.len() <= 8 => Ok(items.to_vec()),
             Some(items) => Err(self.bad(format!("it calls {callee:?} with {} arguments", items.len()))),
             None => Err(self.bad(format!("it calls {callee:?} with something that is not a tuple"))),
         }
@@ -489,50 +484,54 @@ impl<'a> Machine<'a> {
     /// A name, known or not.
     fn global(&mut self, module: &str, name: &str) -> Global {
         global(module, name).unwrap_or_else(|| {
-            self.unknown.push(shown(&format!("{module}.{name}")));
+            let runs = runs_programs(module, name);
+            self.unknown.push(Unknown { name: shown(&format!("{module}.{name}")), runs });
             Global::Unknown(self.unknown.len() - 1)
         })
     }
 
-    /// The error of calling a name that is not on the allow-list.
-    fn refused(&self, which: usize) -> PthError {
-        PthError::Refused(self.unknown.get(which).cloned().unwrap_or_default())
+    /// Stands for what calling a name that is not on the allow-list would give. A call that could run a program has no
+    /// place beside weights, so the file is refused.
+    fn unread(&self, which: usize) -> Result<Value<'a>> {
+        match self.unknown.get(which) {
+            Some(Unknown { runs: false, .. }) => Ok(Value::Unread(which)),
+            unknown => Err(PthError::Refused(unknown.map(|u| u.name.clone()).unwrap_or_default())),
+        }
+    }
+
+    /// A new, empty instance of one of the known classes.
+    fn instance(&mut self, class: Global, arguments: &[Value<'a>]) -> Result<Value<'a>> {
+        let object = match class {
+            Global::OrderedDict | Global::Dictionary if arguments.is_empty() => Object::Dict(Dict::new(Vec::new())),
+            Global::Namespace if arguments.is_empty() => {
+                Object::Dict(Dict { items: Vec::new(), attributes_count: true })
+            }
+            Global::Parameter | Global::TensorClass if arguments.is_empty() => Object::Blank(class),
+            _ => return Err(self.bad(format!("it makes a new {class:?} from {} values", arguments.len()))),
+        };
+        Ok(self.add(object))
     }
 
     /// What calling one of the known names gives.
     fn reduce(&mut self, callee: Global, arguments: Vec<Value<'a>>) -> Result<Value<'a>> {
         match (callee, arguments.as_slice()) {
-            (Global::OrderedDict, []) => Ok(self.add(Object::Dict(Dict::new(Vec::new())))),
-            // Python 2: a list of pairs.
-            (Global::OrderedDict, [list]) => {
-                let Some(Object::Sequence(taken)) = self.take_over(*list) else {
-                    return Err(self.bad("an OrderedDict of something that is not a list"));
-                };
-                let mut items = Vec::with_capacity(taken.len());
-                for pair in taken {
-                    match self.sequence(pair) {
-                        Some([key, value]) => items.push((*key, *value)),
-                        _ => return Err(self.bad("an OrderedDict with an item that is not a pair")),
-                    }
-                }
-                Ok(self.add(Object::Dict(Dict::new(items))))
-            }
-            // A Counter's only argument is a dictionary; a defaultdict's, what makes its defaults.
-            (Global::Dictionary, [] | [Value::Global(_) | Value::None]) => {
+            (Global::OrderedDict, [list]) => self.ordered(*list),
+            // A defaultdict's argument is what makes its defaults.
+            (Global::OrderedDict, []) | (Global::Dictionary, [] | [Value::Global(_) | Value::None]) => {
                 Ok(self.add(Object::Dict(Dict::new(Vec::new()))))
             }
+            // A Counter's is a dictionary.
             (Global::Dictionary, [items]) => match self.take_over(*items) {
                 Some(Object::Dict(dict)) => Ok(self.add(Object::Dict(dict))),
                 _ => Err(self.bad("a dictionary of something that is none")),
             },
             (Global::Row, []) => Ok(self.add(Object::Sequence(Vec::new()))),
-            (Global::Row, [items]) if self.sequence(*items).is_some() => Ok(*items),
+            (Global::Row | Global::Size, [items]) if self.sequence(*items).is_some() => Ok(*items),
             (Global::ByteArray, []) => Ok(Value::Bytes(&[])),
             (
                 Global::ByteArray,
                 [bytes @ (Value::Bytes(_) | Value::Latin1(_) | Value::Text(_))] | [bytes, Value::Text(_)],
             ) => Ok(*bytes),
-            (Global::Size, [sizes]) if self.sequence(*sizes).is_some() => Ok(*sizes),
             (Global::Device, [Value::Text(name)] | [Value::Text(name), Value::Int(_)]) => Ok(Value::Text(name)),
             (Global::Encode, [Value::Text(text), Value::Text("latin1" | "latin-1")]) => {
                 if text.chars().all(|c| u32::from(c) < 256) {
@@ -543,8 +542,7 @@ impl<'a> Machine<'a> {
             }
             (Global::RebuildTensor, [storage, offset, shape, strides])
             | (Global::RebuildTensorV2, [storage, offset, shape, strides, _, _]) => {
-                let view = self.view(*storage, *offset, *shape, *strides)?;
-                Ok(self.add(Object::View(view)))
+                self.tensor(*storage, *offset, *shape, *strides)
             }
             (Global::RebuildTensorV2, [storage, offset, shape, strides, _, _, metadata]) => {
                 // It says that the numbers are negated or conjugated, when it says anything.
@@ -558,16 +556,45 @@ impl<'a> Machine<'a> {
                         self.bad_tensor("it is stored with metadata (negated or conjugated), which is not read")
                     );
                 }
-                let view = self.view(*storage, *offset, *shape, *strides)?;
-                Ok(self.add(Object::View(view)))
+                self.tensor(*storage, *offset, *shape, *strides)
             }
             (Global::RebuildParameter, [tensor, _, _]) | (Global::Parameter, [tensor] | [tensor, _])
-                if self.is_view(*tensor) =>
+                if self.is_view(*tensor) || matches!(tensor, Value::Unread(_)) =>
             {
                 Ok(*tensor)
             }
             _ => Err(self.bad(format!("it calls {callee:?} with {} arguments that do not fit", arguments.len()))),
         }
+    }
+
+    /// An OrderedDict as Python 2 writes it: from a list of pairs.
+    fn ordered(&mut self, list: Value<'a>) -> Result<Value<'a>> {
+        let Some(Object::Sequence(taken)) = self.take_over(list) else {
+            return Err(self.bad("an OrderedDict of something that is not a list"));
+        };
+        let mut items = Vec::with_capacity(taken.len());
+        for pair in taken {
+            match self.sequence(pair) {
+                Some([key, value]) => items.push((*key, *value)),
+                _ => return Err(self.bad("an OrderedDict with an item that is not a pair")),
+            }
+        }
+        Ok(self.add(Object::Dict(Dict::new(items))))
+    }
+
+    /// A tensor over a storage; unread, if the storage's kind of numbers is not known.
+    fn tensor(
+        &mut self,
+        storage: Value<'a>,
+        offset: Value<'a>,
+        shape: Value<'a>,
+        strides: Value<'a>,
+    ) -> Result<Value<'a>> {
+        if let Value::Unread(which) = storage {
+            return Ok(Value::Unread(which));
+        }
+        let view = self.view(storage, offset, shape, strides)?;
+        Ok(self.add(Object::View(view)))
     }
 
     fn add(&mut self, object: Object<'a>) -> Value<'a> {
@@ -588,8 +615,10 @@ impl<'a> Machine<'a> {
     /// BUILD: gives an object its attributes.
     fn build(&mut self) -> Result<()> {
         let state = self.pop()?;
-        let Value::Object(target) = self.top()? else {
-            return Err(self.bad("it builds something that has no parts"));
+        let target = match self.top()? {
+            Value::Object(target) => target,
+            Value::Unread(_) => return Ok(()),
+            _ => return Err(self.bad("it builds something that has no parts")),
         };
         let parts = self.sequence(state).map(|items| items.get(..8).unwrap_or(items).to_vec()).unwrap_or_default();
         let filled = match (self.objects.get(target), parts.as_slice()) {
@@ -626,7 +655,7 @@ impl<'a> Machine<'a> {
     }
 
     /// The storage that a persistent id names: ("storage", class, key, location, number of elements).
-    fn storage(&mut self, id: Value<'a>) -> Result<usize> {
+    fn storage(&mut self, id: Value<'a>) -> Result<Value<'a>> {
         let (class, key, numel) = match self.sequence(id) {
             Some([Value::Text("storage"), class, Value::Text(key), _, Value::Int(numel)])
             | Some([Value::Text("storage"), class, Value::Text(key), _, Value::Int(numel), Value::None]) => {
@@ -640,8 +669,11 @@ impl<'a> Machine<'a> {
             }
             _ => return Err(self.bad("a reference to something that is not a storage")),
         };
-        let Value::Global(Global::Storage(dtype)) = class else {
-            return Err(self.bad(format!("storage {} without a kind of numbers", shown(key))));
+        let dtype = match class {
+            Value::Global(Global::Storage(dtype)) => dtype,
+            // Numbers of another kind: complex ones, quantised ones.
+            Value::Global(Global::Unknown(which)) => return self.unread(which),
+            _ => return Err(self.bad(format!("storage {} without a kind of numbers", shown(key)))),
         };
         let numel =
             usize::try_from(numel).map_err(|_| self.bad(format!("storage {} of {numel} elements", shown(key))))?;
@@ -656,11 +688,11 @@ impl<'a> Machine<'a> {
                     dtype.name()
                 )));
             }
-            return Ok(known);
+            return Ok(Value::Storage(known));
         }
         self.keys.insert(key, self.storages.len());
         self.storages.push(Claim { key, dtype, numel });
-        Ok(self.storages.len() - 1)
+        Ok(Value::Storage(self.storages.len() - 1))
     }
 
     /// A tensor over a storage, if it stays inside.

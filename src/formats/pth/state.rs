@@ -29,6 +29,8 @@ pub enum Plain {
     Text(String),
     /// Bytes.
     Bytes(Vec<u8>),
+    /// What Python would make by calling this function or class, which is not done here.
+    Unread(String),
 }
 
 /// One entry of a checkpoint.
