@@ -12,6 +12,69 @@ pub struct Random {
     chacha: ChaCha8Rng,
 }
 
+/// Everything in this crate that is drawn at random, and its stream of a seed's numbers: the whole table. The numbers are
+/// fixed for good, because runs that were stopped are continued by them.
+///
+/// What is drawn in every step or epoch has 2^40 streams in a row, one each, so that it can be drawn without what came
+/// before. (Streets draw under keys of their own, see `street`.)
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stream {
+    /// Something that needs no stream of its own: a test, an example, a benchmark.
+    Only,
+    /// Inputs of a gradient-check case that are the same for any seed.
+    FixedInputs,
+    /// The directions of the Taylor test.
+    TaylorDirections,
+    /// The cotangents of a gradient check.
+    Cotangents,
+    /// The directions in which one input of a gradient check is moved.
+    InputDirections(u64),
+    /// The weights that a network starts with.
+    Weights,
+    /// The inputs of a gradient-check case.
+    CaseInputs,
+    /// The order of the samples in an epoch.
+    Order(u64),
+    /// Mirroring and colour jitter of a step's batch.
+    Augmentation(u64),
+    /// The pool of numbers that ties of the auto-mask are broken with.
+    TiePool,
+    /// Which of them a step takes.
+    Ties(u64),
+    /// Dropout in a training step.
+    Dropout(u64),
+    /// Dropout while rotations are learnt.
+    RotationDropout,
+    /// The rotations of a step of their pretraining.
+    Rotations(u64),
+    /// The rotations that go on beside a training step.
+    KeptRotations(u64),
+}
+
+impl Stream {
+    /// The stream's number.
+    pub fn number(self) -> u64 {
+        let each = |family: u64, step: u64| (family << 40).wrapping_add(step);
+        match self {
+            Stream::Only => 0,
+            Stream::FixedInputs => 8,
+            Stream::TaylorDirections => 0x7A7,
+            Stream::Cotangents => 0xC07,
+            Stream::InputDirections(input) => 0xD12 + input,
+            Stream::Weights => 0x1417,
+            Stream::CaseInputs => 0xCA5E,
+            Stream::Order(epoch) => each(1, epoch),
+            Stream::Augmentation(step) => each(2, step),
+            Stream::TiePool => each(3, 0) - 1,
+            Stream::Ties(step) => each(3, step),
+            Stream::Dropout(step) => each(4, step),
+            Stream::RotationDropout => each(5, 0) - 1,
+            Stream::Rotations(step) => each(5, step),
+            Stream::KeptRotations(step) => each(6, step),
+        }
+    }
+}
+
 /// Where a [`Random`] stands, to go on from there.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RandomState {
@@ -29,6 +92,11 @@ impl Random {
         let mut chacha = ChaCha8Rng::seed_from_u64(seed);
         chacha.set_stream(stream);
         Random { seed, stream, chacha }
+    }
+
+    /// A generator for `seed` and one of this crate's streams.
+    pub fn of(seed: u64, stream: Stream) -> Self {
+        Random::new(seed, stream.number())
     }
 
     /// Where it stands.
@@ -90,6 +158,24 @@ impl Random {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn streams_are_all_different() {
+        let last = (1 << 40) - 2;
+        let mut all = vec![Stream::Only, Stream::FixedInputs, Stream::TaylorDirections, Stream::Cotangents];
+        all.extend([Stream::Weights, Stream::CaseInputs, Stream::TiePool, Stream::RotationDropout]);
+        all.extend([0, 1, 200].map(Stream::InputDirections));
+        for family in [Stream::Order, Stream::Augmentation, Stream::Ties] {
+            all.extend([0, 1, last].map(family));
+        }
+        for family in [Stream::Dropout, Stream::Rotations, Stream::KeptRotations] {
+            all.extend([0, 1, last].map(family));
+        }
+        let mut numbers: Vec<u64> = all.iter().map(|s| s.number()).collect();
+        numbers.sort_unstable();
+        numbers.dedup();
+        assert_eq!(numbers.len(), all.len());
+    }
 
     #[test]
     fn the_stream_is_fixed() {

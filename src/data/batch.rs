@@ -15,7 +15,7 @@ use super::augment::{Jitter, flip, flip_intrinsics};
 use super::resize::lanczos;
 use crate::camera::Intrinsics;
 use crate::error::{Error, Result};
-use crate::random::Random;
+use crate::random::{Random, Stream};
 use crate::tensor::Tensor;
 
 /// What is done to samples before training.
@@ -98,7 +98,7 @@ pub fn samples_of_step(len: usize, batch: usize, seed: u64, step: u64) -> Vec<us
             let epoch = at / len as u64;
             if orders.last().is_none_or(|(e, _)| *e != epoch) {
                 let mut order: Vec<usize> = (0..len).collect();
-                Random::new(seed, ORDER_STREAM.wrapping_add(epoch)).shuffle(&mut order);
+                Random::of(seed, Stream::Order(epoch)).shuffle(&mut order);
                 orders.push((epoch, order));
             }
             orders[orders.len() - 1].1[(at % len as u64) as usize]
@@ -106,15 +106,13 @@ pub fn samples_of_step(len: usize, batch: usize, seed: u64, step: u64) -> Vec<us
         .collect()
 }
 
-const ORDER_STREAM: u64 = 1 << 40;
-const AUGMENT_STREAM: u64 = 2 << 40;
 /// Scales of the target that the loss looks at.
 const SCALES: usize = 4;
 
 /// The batch of a step (from 0).
 pub fn batch_of_step(data: &dyn Dataset, augment: Augment, batch: usize, seed: u64, step: u64) -> Result<Batch> {
     let samples = samples_of_step(data.len(), batch, seed, step);
-    let mut random = Random::new(seed, AUGMENT_STREAM.wrapping_add(step));
+    let mut random = Random::of(seed, Stream::Augmentation(step));
     let mut pyramids: Vec<Vec<Arc<RgbImage>>> = Vec::new();
     let mut sources: [Vec<Arc<RgbImage>>; 2] = Default::default();
     let mut seen: [Vec<Arc<RgbImage>>; 3] = Default::default();

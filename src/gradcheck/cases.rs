@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::{Kinks, Options, Report, Tolerance, check};
 use crate::ops::registry::AnyCase;
-use crate::random::Random;
+use crate::random::{Random, Stream};
 use crate::tensor::{Tensor, Var};
 
 /// What the check of one case found.
@@ -30,7 +30,7 @@ impl fmt::Display for CaseReport {
 
 /// The inputs of a case, drawn from a seed.
 pub fn draw(case: &dyn AnyCase, seed: u64) -> Vec<Tensor<f64>> {
-    let mut random = Random::new(seed, 0xCA5E);
+    let mut random = Random::of(seed, Stream::CaseInputs);
     case.inputs().iter().map(|input| input.draw(&mut random)).collect()
 }
 

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::options::{Options, Stencil};
-use crate::random::Random;
+use crate::random::{Random, Stream};
 use crate::tensor::{Tensor, Var};
 
 /// The quotients along one movement of the inputs, met with the cotangents.
@@ -105,7 +105,7 @@ pub fn differences(
     for &i in tracked {
         let n = inputs[i].len();
         let directions = options.directions.filter(|&count| count < n).map(|count| {
-            let mut random = Random::new(options.seed, 0xD12 + i as u64);
+            let mut random = Random::of(options.seed, Stream::InputDirections(i as u64));
             let mut draw = |_| (0..n).map(|_| random.normal() / (n as f64).sqrt()).collect::<Vec<f64>>();
             (0..count).map(&mut draw).collect::<Vec<_>>()
         });

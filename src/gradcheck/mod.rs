@@ -32,7 +32,7 @@ pub use options::{Cotangents, Kinks, Options, Stencil, Tolerance};
 pub use report::{InputReport, Outside, Report};
 pub use taylor::{taylor, taylor_slope};
 
-use crate::random::Random;
+use crate::random::{Random, Stream};
 use crate::tensor::{Tape, Tensor, Var};
 
 /// Compares the gradient of `f` at `inputs` with finite differences.
@@ -162,7 +162,7 @@ fn gradients_for(
 
 /// A random cotangent for every tracked output: of magnitude 0.5 to 1.5, of either sign, so that no element is lost.
 pub fn cotangents(outputs: &[Var<f64>], seed: u64) -> Vec<Option<Tensor<f64>>> {
-    let mut random = Random::new(seed, 0xC07);
+    let mut random = Random::of(seed, Stream::Cotangents);
     outputs
         .iter()
         .map(|y| {

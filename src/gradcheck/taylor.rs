@@ -1,7 +1,7 @@
 //! The Taylor test: is a gradient right along a direction, without choosing a step?
 
 use super::{Options, evaluate, gradients};
-use crate::random::Random;
+use crate::random::{Random, Stream};
 use crate::tensor::{Tensor, Var};
 
 /// How fast the remainder of the first-order Taylor expansion goes away: with r(h) = |f(x + h d) - f(x) - h g.d|, the
@@ -43,7 +43,7 @@ pub fn taylor(
     steps: [f64; 2],
 ) -> Option<f64> {
     let found = gradients(&f, inputs, options)?;
-    let mut random = Random::new(options.seed, 0x7A7);
+    let mut random = Random::of(options.seed, Stream::TaylorDirections);
     let mut draw = |x: &Tensor<f64>| Tensor::build(*x.shape(), |d| d.iter_mut().for_each(|d| *d = random.normal()));
     let directions: Vec<_> = found.inputs.iter().zip(inputs).map(|(g, x)| g.as_ref().map(|_| draw(x))).collect();
     let dot = |a: &Tensor<f64>, b: &Tensor<f64>| a.data().iter().zip(b.data()).map(|(a, b)| a * b).sum::<f64>();

@@ -5,7 +5,7 @@ use super::decoder::Decoder;
 use super::encoder::Encoder;
 use super::pose::{PoseDecoder, PoseEncoder};
 use crate::nn::{Builder, Context, Folded, Params};
-use crate::random::Random;
+use crate::random::{Random, Stream};
 use crate::tensor::{Float, Tensor, Var, profile};
 
 /// Depth encoder and decoder, pose encoder and decoder: `encoder`, `depth`, `pose_encoder`, `pose` in a checkpoint.
@@ -22,7 +22,7 @@ pub struct MonoVit {
 impl MonoVit {
     /// The networks, and their parameters as they start, drawn from `seed`.
     pub fn new<T: Float>(config: Config, seed: u64) -> (Self, Params<T>) {
-        let (mut params, mut random) = (Params::new(), Random::new(seed, 0x1417));
+        let (mut params, mut random) = (Params::new(), Random::of(seed, Stream::Weights));
         let b = &mut Builder::new(&mut params, &mut random).starting(config.start);
         let model = MonoVit {
             encoder: Encoder::new(&mut b.at("encoder"), &config),

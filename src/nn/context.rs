@@ -5,7 +5,7 @@ use std::collections::HashMap;
 
 use super::Folded;
 use super::params::{ParamId, Params};
-use crate::random::Random;
+use crate::random::{Random, Stream};
 use crate::tensor::{Float, Gradients, Tape, Tensor, Var, profile};
 
 /// What normalisations do.
@@ -53,7 +53,7 @@ impl<T: Float> Context<T> {
     fn constant(params: &Params<T>, mode: Mode) -> Self {
         let vars =
             profile::phase("parameters to leaves", || params.iter().map(|(_, p)| p.value.clone().into()).collect());
-        Self::with(vars, mode, Random::new(0, 0))
+        Self::with(vars, mode, Random::of(0, Stream::Only))
     }
 
     fn with(vars: Vec<Var<T>>, mode: Mode, random: Random) -> Self {

@@ -1,6 +1,6 @@
 //! Gradient-check cases: an op, its attributes, and what its inputs are filled with.
 
-use crate::random::Random;
+use crate::random::{Random, Stream};
 use crate::tensor::{Shape, Tensor};
 
 /// The largest error that a smooth op may show: |analytic - numeric| / max |analytic|, per input, in f64.
@@ -139,7 +139,7 @@ impl Input {
                 all
             }
             Fill::Fixed { low, high } => {
-                let mut random = Random::new(0, 8);
+                let mut random = Random::of(0, Stream::FixedInputs);
                 (0..n).map(|_| random.uniform(*low, *high)).collect()
             }
             Fill::Values(values) => values.clone(),

@@ -14,7 +14,7 @@ use crate::data::batch::Batch;
 use crate::monovit::MonoVit;
 use crate::nn::{Context, Params};
 use crate::optim::{AdamW, Decay, Group, Schedule};
-use crate::random::Random;
+use crate::random::{Random, Stream};
 use crate::tensor::{Tape, Tensor, Var};
 
 /// How much pairs are turned, and for how long, in shares of the training's steps.
@@ -83,7 +83,7 @@ impl RotationPlan {
         batch: &Batch,
         seed: u64,
     ) -> Option<Var<f32>> {
-        let mut random = Random::new(seed, KEEP_STREAM.wrapping_add(step));
+        let mut random = Random::of(seed, Stream::KeptRotations(step));
         let error = || rotation_error(model, c, batch, self.size(self.steps), &mut random);
         (step < self.keep && self.steps > 0).then(error).map(|e| e.affine(self.weight, 0.0))
     }
@@ -96,9 +96,6 @@ pub struct Lesson {
     seed: u64,
 }
 
-const STREAM: u64 = 5 << 40;
-const KEEP_STREAM: u64 = 6 << 40;
-
 impl Lesson {
     /// No steps taken.
     pub fn new(plan: RotationPlan, params: &Params<f32>, seed: u64) -> Self {
@@ -109,8 +106,8 @@ impl Lesson {
     pub fn step(&mut self, model: &MonoVit, params: &mut Params<f32>, batch: &Batch) -> f64 {
         let step = self.adamw.steps;
         let tape = Tape::new();
-        let mut random = Random::new(self.seed, STREAM.wrapping_add(step));
-        let c = Context::training(params, &tape, Random::new(self.seed, STREAM - 1));
+        let mut random = Random::of(self.seed, Stream::Rotations(step));
+        let c = Context::training(params, &tape, Random::of(self.seed, Stream::RotationDropout));
         let error = rotation_error(model, &c, batch, self.plan.size(step), &mut random);
         let gradients = c.gradients(&mut error.backward());
         let schedule = Schedule { warm_up: WARM_UP, decay: Decay::Constant };

@@ -11,7 +11,7 @@ use crate::monovit::config::Config;
 use crate::monovit::loss::{Loss, LossConfig, Scales, TieBreak, Views, loss};
 use crate::nn::{Context, Params};
 use crate::optim::{AdamW, Average, Group, clip_norm};
-use crate::random::Random;
+use crate::random::{Random, Stream};
 use crate::tensor::profile;
 use crate::tensor::{Tape, Var};
 
@@ -61,9 +61,6 @@ fn views(batch: &Batch, scales: Scales) -> Views<f32> {
     }
 }
 
-const TIE_STREAM: u64 = 3 << 40;
-const DROP_STREAM: u64 = 4 << 40;
-
 impl Trainer {
     /// A model at its start.
     pub fn new(config: Config, plan: Plan) -> Self {
@@ -76,7 +73,7 @@ impl Trainer {
         let mut adamw = AdamW::new(&params);
         adamw.betas = plan.optim.betas;
         let average = (plan.optim.average > 0.0).then(|| Average::new(&params, plan.optim.average));
-        let ties = TieBreak::new(plan.loss.tie_break, &mut Random::new(plan.seed, TIE_STREAM - 1));
+        let ties = TieBreak::new(plan.loss.tie_break, &mut Random::of(plan.seed, Stream::TiePool));
         Trainer { model, params, plan, adamw, average, ties }
     }
 
@@ -112,11 +109,11 @@ impl Trainer {
     /// The loss of a batch, and the context it was computed in.
     fn forward(&self, tape: &Tape<f32>, batch: &Batch) -> (Context<f32>, Loss<f32>) {
         let step = self.adamw.steps;
-        let c = Context::training(&self.params, tape, Random::new(self.plan.seed, DROP_STREAM.wrapping_add(step)));
+        let c = Context::training(&self.params, tape, Random::of(self.plan.seed, Stream::Dropout(step)));
         let [prev, target, next] = batch.seen.each_ref().map(|t| Var::constant(t.clone()));
         let disparities = self.model.disparities(&c, &target);
         let transforms = self.model.transforms(&c, &prev, &target, &next);
-        let mut random = Random::new(self.plan.seed, TIE_STREAM.wrapping_add(step));
+        let mut random = Random::of(self.plan.seed, Stream::Ties(step));
         let auto_mask = self.plan.loss.auto_mask && step >= self.plan.auto_mask_after;
         let config = LossConfig { auto_mask, ..self.plan.loss };
         let found =

@@ -10,7 +10,7 @@ use parallax::monovit::setup::check_size;
 use parallax::monovit::{Config, MonoVit, Preset};
 use parallax::nn::{Context, Folded, Named, fit};
 use parallax::ops::Conv2d;
-use parallax::random::Random;
+use parallax::random::{Random, Stream};
 use parallax::tensor::{Tape, Tensor, Var};
 use parallax::{Error, Result};
 use serde::Serialize;
@@ -102,7 +102,7 @@ pub fn run(path: &Path) -> Result<()> {
     let views = Views { pyramid, sources, smaller_sources: Vec::new(), intrinsics: vec![intrinsics; batch] };
 
     let tape = Tape::new();
-    let c = Context::training(&params, &tape, Random::new(0, 0));
+    let c = Context::training(&params, &tape, Random::of(0, Stream::Only));
     let disparities = model.disparities(&c, &target);
     let transforms = model.transforms(&c, &prev, &target, &next);
     let found = loss(&disparities, &transforms, &views, &LossConfig::default(), None).total.value().item();

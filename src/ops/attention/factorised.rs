@@ -1,6 +1,7 @@
 //! Factorised attention: linear in the number of tokens, because keys meet values before queries.
 
 use super::head_products::Heads;
+use crate::ops::support::put::put_run;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::gemm::Rows;
 use crate::tensor::pool::Buffer;
@@ -196,10 +197,7 @@ impl<T: Float> Op<T> for FactorisedAttention {
 fn put<T: Float>(out: &mut [T], stride: usize, first: usize, accum: Accum, dense: &[T], channels: usize) {
     for (out, d) in out.chunks_exact_mut(stride).zip(dense.chunks_exact(channels)) {
         let out = &mut out[first..first + channels];
-        match accum {
-            Accum::Replace => out.copy_from_slice(d),
-            Accum::Add => out.iter_mut().zip(d).for_each(|(o, &d)| *o += d),
-        }
+        put_run(accum, out, d);
     }
 }
 

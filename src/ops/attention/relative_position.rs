@@ -1,10 +1,11 @@
 //! The convolutional relative position encoding of factorised attention.
 
-use crate::ops::normalise::batch_norm::add_sums;
+use crate::ops::support::put::{begin_sum, put};
+use crate::ops::support::sums::add_sums;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::pool::Buffer;
 use crate::tensor::simd::copy_run;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
 /// `out = q * (depthwise convolution of v as an image)`, with windows of several sizes, each over its own heads (Xu et
 /// al. 2021, 2104.06399, section 3.3). Zero padding half the window.
@@ -395,13 +396,8 @@ impl<T: Float> Op<T> for ConvRelativePosition {
                 let rows = g[first..].chunks_exact(channels).zip(conv[first..].chunks_exact(channels));
                 for (out, (g, conv)) in out.chunks_exact_mut(stride).zip(rows) {
                     let terms = out.iter_mut().zip(g.iter().zip(conv));
-                    match accum {
-                        Accum::Replace => terms.for_each(|(o, (&g, &c))| *o = g * c),
-                        Accum::Add => terms.for_each(|(o, (&g, &c))| *o += g * c),
-                    }
-                    if accum == Accum::Replace {
-                        out[channels..2 * channels].fill(T::ZERO);
-                    }
+                    put(accum, terms.map(|(o, (&g, &c))| (o, g * c)));
+                    begin_sum(&mut out[channels..2 * channels], accum);
                 }
                 simd::dispatch(
                     #[inline(always)]
@@ -415,10 +411,7 @@ impl<T: Float> Op<T> for ConvRelativePosition {
                             |x, k, sum| {
                                 let lanes = k * LANES..((k + 1) * LANES).min(channels);
                                 let out = &mut out[x * stride + 2 * channels..][..channels][lanes];
-                                match accum {
-                                    Accum::Replace => out.iter_mut().zip(sum).for_each(|(o, s)| *o = s),
-                                    Accum::Add => out.iter_mut().zip(sum).for_each(|(o, s)| *o += s),
-                                }
+                                put(accum, out.iter_mut().zip(sum).map(|(o, s)| (o, s)));
                             },
                         );
                     },

@@ -3,8 +3,9 @@
 use super::conv2d::geometry::{Beyond, Geometry};
 use super::conv2d::kernel;
 use super::conv2d::parts::whole;
-use crate::ops::product::linear;
 use crate::ops::support::epilogue::Finish;
+use crate::ops::support::row_products::rows_of;
+use crate::ops::support::sums::bias_gradient;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 
@@ -148,7 +149,7 @@ impl<T: Float> Op<T> for ConvTranspose2d {
         if let Some(x) = x {
             sink.accumulate(1, |out, accum| kernel::weight_gradient(out, accum, &g, &whole(&g, dy.data()), x.data()));
         }
-        sink.accumulate(2, |out, accum| linear::bias_gradient(out, accum, dy.data()));
+        sink.accumulate(2, |out, accum| bias_gradient(out, accum, rows_of(&dy)));
     }
 }
 

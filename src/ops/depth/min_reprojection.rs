@@ -1,7 +1,9 @@
 //! The per-pixel minimum over candidate losses (Godard et al., 1806.01260), and its mean.
 
+use crate::ops::support::put::put;
+use crate::ops::support::sums::pairwise_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply};
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
 /// The mean over pixels of the minimum over `candidates`, one or more tensors of one shape; and (auxiliary) the index of
 /// the winner of each pixel, in that shape.
@@ -61,10 +63,10 @@ impl<T: Float> Op<T> for MinReprojection {
                         },
                     );
                 }
-                *sum = crate::ops::reduce::sum::pairwise_sum(best);
+                *sum = pairwise_sum(best);
             });
         });
-        let mean = crate::ops::reduce::sum::pairwise_sum(&sums) / T::of(n as f64);
+        let mean = pairwise_sum(&sums) / T::of(n as f64);
         (vec![Tensor::scalar(mean), winner.clone()], (winner, inputs.len()))
     }
 
@@ -77,10 +79,7 @@ impl<T: Float> Op<T> for MinReprojection {
                 let terms = out.iter_mut().zip(winner.data());
                 simd::dispatch(
                     #[inline(always)]
-                    || match accum {
-                        Accum::Replace => terms.for_each(|(d, &w)| *d = if w == index { share } else { T::ZERO }),
-                        Accum::Add => terms.for_each(|(d, &w)| *d += if w == index { share } else { T::ZERO }),
-                    },
+                    || put(accum, terms.map(|(d, &w)| (d, if w == index { share } else { T::ZERO }))),
                 );
             });
         }

@@ -1,6 +1,7 @@
 //! Rigid transforms from axis-angle and translation.
 
-use super::rotation::{put, rotation, rotation_gradient, vector};
+use super::rotation::{rotation, rotation_gradient, vector};
+use crate::ops::support::put::put_rounded;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 
@@ -53,7 +54,7 @@ impl<T: Float> Op<T> for PoseMatrix {
             for ((out, v), t) in samples {
                 let (r, t) = self.matrix(vector(v), vector(t));
                 for ((out, r), t) in out.chunks_exact_mut(4).zip(r).zip(t) {
-                    put(out, Accum::Replace, r.into_iter().chain([t]));
+                    put_rounded(out, Accum::Replace, r.into_iter().chain([t]));
                 }
             }
         });
@@ -78,14 +79,14 @@ impl<T: Float> Op<T> for PoseMatrix {
                         row.iter_mut().zip(by_last).for_each(|(d, y)| *d -= t * y);
                     }
                 }
-                put(out, accum, rotation_gradient(v, by_matrix));
+                put_rounded(out, accum, rotation_gradient(v, by_matrix));
             }
         });
         sink.accumulate(1, |out, accum| {
             for (i, out) in out.chunks_exact_mut(3).enumerate() {
                 let (v, _, _, by_last) = sample(i);
                 let dt = if self.invert { times(rotation(v), by_last).map(|x| -x) } else { by_last };
-                put(out, accum, dt);
+                put_rounded(out, accum, dt);
             }
         });
     }

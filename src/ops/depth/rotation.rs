@@ -1,5 +1,6 @@
 //! Rotations from axis-angle vectors: the exponential map, right in value and gradient at the identity too.
 
+use crate::ops::support::put::put_rounded;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 
@@ -83,16 +84,6 @@ pub(crate) fn vector<T: Float>(x: &[T]) -> [f64; 3] {
     [x[0].f64(), x[1].f64(), x[2].f64()]
 }
 
-/// Writes or adds finished numbers.
-pub(crate) fn put<T: Float>(out: &mut [T], accum: Accum, values: impl IntoIterator<Item = f64>) {
-    for (o, x) in out.iter_mut().zip(values) {
-        match accum {
-            Accum::Replace => *o = T::of(x),
-            Accum::Add => *o += T::of(x),
-        }
-    }
-}
-
 impl<T: Float> Op<T> for AxisAngleToRotation {
     type Saved = Tensor<T>;
 
@@ -107,7 +98,7 @@ impl<T: Float> Op<T> for AxisAngleToRotation {
         let v = inputs[0];
         let y = Tensor::build([v.dims()[0], 3, 3], |out| {
             for (out, v) in out.chunks_exact_mut(9).zip(v.data().chunks_exact(3)) {
-                put(out, Accum::Replace, rotation(vector(v)).into_iter().flatten());
+                put_rounded(out, Accum::Replace, rotation(vector(v)).into_iter().flatten());
             }
         });
         (vec![y], v.clone())
@@ -120,7 +111,7 @@ impl<T: Float> Op<T> for AxisAngleToRotation {
             let samples = out.chunks_exact_mut(3).zip(v.data().chunks_exact(3)).zip(g.data().chunks_exact(9));
             for ((out, v), g) in samples {
                 let g = [vector(&g[..3]), vector(&g[3..6]), vector(&g[6..])];
-                put(out, accum, rotation_gradient(vector(v), g));
+                put_rounded(out, accum, rotation_gradient(vector(v), g));
             }
         });
     }

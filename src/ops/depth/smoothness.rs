@@ -1,9 +1,10 @@
 //! Edge-aware smoothness of a disparity, in one op (Godard et al., 1609.03677, with the mean normalisation of Wang et al.,
 //! 1712.00175).
 
-use crate::ops::reduce::sum::pairwise_sum;
+use crate::ops::support::put::{begin_sum, put};
+use crate::ops::support::sums::pairwise_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, pool::Buffer, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, pool::Buffer, simd};
 
 /// Guards the division by the mean disparity, as published.
 const EPSILON: f64 = 1e-7;
@@ -138,10 +139,7 @@ impl<T: Float> Op<T> for Smoothness {
                 let [mean, sum] = samples[b];
                 let mut slopes = Buffer::stale(width);
                 let through_mean = -(g * sum / (mean * mean) / T::of(plane as f64));
-                match accum {
-                    Accum::Replace => out.fill(through_mean),
-                    Accum::Add => out.iter_mut().for_each(|o| *o += through_mean),
-                }
+                put(accum, out.iter_mut().map(|o| (o, through_mean)));
                 for (k, direction) in both.iter().enumerate() {
                     let scale = g * T::of(direction.share) / mean;
                     let slope = |d: T, e: T, out: &mut T| *out = scale * e * sign(d);
@@ -164,9 +162,7 @@ impl<T: Float> Op<T> for Smoothness {
             parallel::for_each_chunk(out, width * channels, 16 * image.len(), |i, out| {
                 let (b, row) = (i / height, i % height);
                 let mut slopes = Buffer::stale(width);
-                if accum == Accum::Replace {
-                    out.fill(T::ZERO);
-                }
+                begin_sum(out, accum);
                 for (k, direction) in both.iter().enumerate() {
                     let scale = -(g * T::of(direction.share / channels as f64) / samples[b][0]);
                     let slope = |d: T, e: T, out: &mut T| *out = scale * e * d.abs();

@@ -5,6 +5,7 @@
 //! channels at once. Nothing but the inputs is saved: the backward pass forms the means again, which costs less than
 //! writing and reading them as images.
 
+use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, pool::Buffer, simd};
 
@@ -277,13 +278,9 @@ impl Kernel {
         expand(g.row(row), upstream, channels);
         let l1 = T::of(self.l1);
         let (xs, ys) = (x.row(row), y.row(row));
-        let write = |out: &mut T, d: T| match accum {
-            Accum::Replace => *out = d,
-            Accum::Add => *out += d,
-        };
         let pixels = xs.iter().zip(ys).zip(upstream.iter());
         if self.ssim == 0.0 {
-            return out.iter_mut().zip(pixels).for_each(|(o, ((&x, &y), &g))| write(o, l1 * g * sign(x - y)));
+            return put(accum, out.iter_mut().zip(pixels).map(|(o, ((&x, &y), &g))| (o, l1 * g * sign(x - y))));
         }
         // The first and last rows of windows hold the row next to them twice; outside there is none.
         let weight = |there: bool, edge: bool| T::of(if !there { 0.0 } else { 1.0 + f64::from(u8::from(edge)) });
@@ -295,9 +292,11 @@ impl Kernel {
             let (u, c, d) = (&ring[up % 3][m], &ring[row % 3][m], &ring[down % 3][m]);
             u.iter().zip(c.iter()).zip(d.iter()).map(move |((&u, &c), &d)| u.mul_add(above, d.mul_add(below, c)))
         });
-        for ((o, ((&x, &y), &g)), ((a, q), p)) in out.iter_mut().zip(pixels).zip(a.zip(q).zip(p)) {
-            write(o, x.mul_add(q, y.mul_add(p, a)) + l1 * g * sign(x - y));
-        }
+        let terms = out.iter_mut().zip(pixels).zip(a.zip(q).zip(p));
+        put(
+            accum,
+            terms.map(|((o, ((&x, &y), &g)), ((a, q), p))| (o, x.mul_add(q, y.mul_add(p, a)) + l1 * g * sign(x - y))),
+        );
     }
 }
 

@@ -4,6 +4,7 @@
 //! four pixels around each place are fetched one place after the other. Nothing but the inputs is saved: projecting
 //! again in the backward pass costs less than writing the coordinates out and reading them back.
 
+use crate::ops::support::put::{begin_sum, put, put_rounded};
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, pool::Buffer, simd};
 
@@ -334,10 +335,7 @@ impl Warp {
                 with_channels!(e.channels, |c| gradient_row(&p, e, c, v, [image, depth, g], &mut row, &mut sums));
                 if let Some(out) = &mut out {
                     let out = out[(v - first) * e.width..][..e.width].iter_mut().zip(row.iter());
-                    match accum {
-                        Accum::Replace => out.for_each(|(o, &d)| *o = d),
-                        Accum::Add => out.for_each(|(o, &d)| *o += d),
-                    }
+                    put(accum, out.map(|(o, &d)| (o, d)));
                 }
             }
             for (by, sums) in partial.iter_mut().zip(sums.chunks_exact(3 * e.width)) {
@@ -371,9 +369,7 @@ impl Warp {
         accum: Accum,
     ) {
         parallel::for_each_chunk(out, e.image(), 32 * g.len(), |b, out| {
-            if accum == Accum::Replace {
-                out.fill(T::ZERO);
-            }
+            begin_sum(out, accum);
             let p = self.projection(b, transform.data(), e.height, e.width);
             let mut places = Places::new();
             for v in 0..e.height {
@@ -465,7 +461,7 @@ impl<T: Float> Op<T> for Warp {
         sink.accumulate(1, |out, accum| by_transform = Some(self.geometry_gradient(all, Some((out, accum)))));
         sink.accumulate(2, |out, accum| {
             let by_transform = by_transform.unwrap_or_else(|| self.geometry_gradient(all, None));
-            super::rotation::put(out, accum, by_transform.into_iter().flatten());
+            put_rounded(out, accum, by_transform.into_iter().flatten());
         });
     }
 }

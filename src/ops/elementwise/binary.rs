@@ -1,9 +1,10 @@
 //! Functions of two numbers, element by element, with broadcasting: trailing dimensions are aligned, and an extent of 1
 //! stretches.
 
+use crate::ops::support::put::{begin_sum, put};
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply1};
 use crate::tensor::shape::MAX_RANK;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
 /// A function of two numbers.
 pub trait Function: Copy + Send + Sync + Default + 'static {
@@ -245,11 +246,9 @@ where
                         let terms = out.iter_mut().zip(g.iter().zip(a.iter().zip(b)));
                         simd::dispatch(
                             #[inline(always)]
-                            || match (accum, side) {
-                                (Accum::Replace, 0) => terms.for_each(|(d, (&g, (&a, &b)))| *d = g * F::da(a, b)),
-                                (Accum::Replace, _) => terms.for_each(|(d, (&g, (&a, &b)))| *d = g * F::db(a, b)),
-                                (Accum::Add, 0) => terms.for_each(|(d, (&g, (&a, &b)))| *d += g * F::da(a, b)),
-                                (Accum::Add, _) => terms.for_each(|(d, (&g, (&a, &b)))| *d += g * F::db(a, b)),
+                            || match side {
+                                0 => put(accum, terms.map(|(d, (&g, (&a, &b)))| (d, g * F::da(a, b)))),
+                                _ => put(accum, terms.map(|(d, (&g, (&a, &b)))| (d, g * F::db(a, b)))),
                             },
                         );
                     });
@@ -261,9 +260,7 @@ where
                 let (per_thread, repeats) = if own > 0 { (own, 1) } else { (out.len(), slices.count) };
                 let work = 2 * g.len();
                 parallel::for_each_chunk(out, per_thread, work, |first, out| {
-                    if accum == Accum::Replace {
-                        out.fill(T::ZERO);
-                    }
+                    begin_sum(out, accum);
                     for i in first * repeats..(first + 1) * repeats {
                         let g = &g.data()[i * slices.result..][..slices.result];
                         // Functions whose derivatives are constant never look at their arguments.

@@ -1,5 +1,6 @@
 //! Dropout (Srivastava et al., 2014).
 
+use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::random::Random;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
@@ -31,10 +32,7 @@ fn masked<T: Float>(out: &mut [T], accum: Accum, x: &[T], mask: &[T], keep: f64)
         let terms = out.iter_mut().zip(x.iter().zip(mask));
         simd::dispatch(
             #[inline(always)]
-            || match accum {
-                Accum::Replace => terms.for_each(|(y, (&x, &m))| *y = f(x, m)),
-                Accum::Add => terms.for_each(|(y, (&x, &m))| *y += f(x, m)),
-            },
+            || put(accum, terms.map(|(y, (&x, &m))| (y, f(x, m)))),
         );
     });
 }

@@ -1,7 +1,8 @@
 //! One of two values, element by element, as a condition says ("where").
 
+use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
 /// `yes` where the condition is not 0 (NaN is not), else `no`; all three of one shape. The condition is not
 /// differentiated.
@@ -60,10 +61,7 @@ impl<T: Float> Op<T> for Select {
                     let share = |c: T, g: T| if (c != T::ZERO) == taken { g } else { T::ZERO };
                     simd::dispatch(
                         #[inline(always)]
-                        || match accum {
-                            Accum::Replace => terms.for_each(|(d, (&c, &g))| *d = share(c, g)),
-                            Accum::Add => terms.for_each(|(d, (&c, &g))| *d += share(c, g)),
-                        },
+                        || put(accum, terms.map(|(d, (&c, &g))| (d, share(c, g)))),
                     );
                 });
             });

@@ -1,7 +1,8 @@
 //! Functions of one number, element by element: each is a line for its value and a line for its derivative.
 
+use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply1};
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
 /// A function of one number.
 pub trait Function: Copy + Send + Sync + 'static {
@@ -11,6 +12,11 @@ pub trait Function: Copy + Send + Sync + 'static {
     fn f<T: Float>(self, x: T) -> T;
     /// The derivative, from the argument, or from the result if [`FROM_RESULT`](Function::FROM_RESULT).
     fn df<T: Float>(self, x: T) -> T;
+    /// The derivative, from the argument in any case.
+    #[inline(always)]
+    fn slope<T: Float>(self, x: T) -> T {
+        if Self::FROM_RESULT { self.df(self.f(x)) } else { self.df(x) }
+    }
     /// Gradient-check cases.
     fn cases() -> Vec<Case<Unary<Self>>>;
 }
@@ -58,10 +64,7 @@ where
                 let terms = out.iter_mut().zip(g.iter().zip(s));
                 simd::dispatch(
                     #[inline(always)]
-                    || match accum {
-                        Accum::Replace => terms.for_each(|(d, (&g, &s))| *d = g * f.df(s)),
-                        Accum::Add => terms.for_each(|(d, (&g, &s))| *d += g * f.df(s)),
-                    },
+                    || put(accum, terms.map(|(d, (&g, &s))| (d, g * f.df(s)))),
                 );
             });
         });
@@ -79,13 +82,14 @@ impl<F: Function> Checked for Unary<F> {
 pub struct Relu;
 
 impl Function for Relu {
+    const FROM_RESULT: bool = true;
     #[inline(always)]
     fn f<T: Float>(self, x: T) -> T {
         if x < T::ZERO { T::ZERO } else { x }
     }
     #[inline(always)]
-    fn df<T: Float>(self, x: T) -> T {
-        if x > T::ZERO { T::ONE } else { T::ZERO }
+    fn df<T: Float>(self, y: T) -> T {
+        if y > T::ZERO { T::ONE } else { T::ZERO }
     }
     fn cases() -> Vec<Case<Unary<Self>>> {
         vec![

@@ -1,7 +1,8 @@
 //! Bilinear sampling of an image at given places (Jaderberg et al., 1506.02025).
 
+use crate::ops::support::put::{begin_sum, put_run};
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
 /// What lies beyond the edge of an image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -171,9 +172,7 @@ impl<T: Float> Op<T> for GridSample {
         sink.accumulate(0, |out, accum| {
             let work = 16 * g.len() + out.len();
             parallel::for_each_chunk(out, size, work, |b, out| {
-                if accum == Accum::Replace {
-                    out.fill(T::ZERO);
-                }
+                begin_sum(out, accum);
                 let g = &g.data()[b * places * channels..][..places * channels];
                 let grid = &grid.data()[b * places * 2..][..places * 2];
                 for (g, place) in g.chunks_exact(channels).zip(grid.chunks_exact(2)) {
@@ -202,10 +201,7 @@ impl<T: Float> Op<T> for GridSample {
                         sums[0] = dot.mul_add(slope[0] * weight[1], sums[0]);
                         sums[1] = dot.mul_add(weight[0] * slope[1], sums[1]);
                     });
-                    match accum {
-                        Accum::Replace => out.copy_from_slice(&sums),
-                        Accum::Add => out.iter_mut().zip(sums).for_each(|(o, s)| *o += s),
-                    }
+                    put_run(accum, out, &sums);
                 }
             });
         });

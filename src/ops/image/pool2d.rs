@@ -1,7 +1,8 @@
 //! Pooling over windows of an image: the largest, and the mean.
 
+use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
 /// The largest element of each window of each channel of [batch, height, width, channels]. Padding never wins, a NaN
 /// does. Of several equal ones the first, row by row, gets the gradient.
@@ -129,9 +130,7 @@ impl<T: Float> Op<T> for MaxPool2d {
                 simd::dispatch(
                     #[inline(always)]
                     || {
-                        if accum == Accum::Replace {
-                            out.fill(T::ZERO);
-                        }
+                        begin_sum(out, accum);
                         for (x, d) in out.chunks_exact_mut(c).enumerate() {
                             let x = x + padding;
                             for oy in windows(y, oh, kernel, stride) {
@@ -232,9 +231,7 @@ impl<T: Float> Op<T> for AvgPool2d {
                 simd::dispatch(
                     #[inline(always)]
                     || {
-                        if accum == Accum::Replace {
-                            out.fill(T::ZERO);
-                        }
+                        begin_sum(out, accum);
                         for oy in windows(y, oh, kernel, stride) {
                             let g = &g.data()[(image * oh + oy) * ow * c..][..ow * c];
                             for kx in 0..kernel {

@@ -1,7 +1,8 @@
 //! Padding by reflection.
 
+use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
 /// Adds rows and columns to [batch, height, width, channels], mirrored about the outermost pixels, which are not
 /// repeated: `c b | a b c d | c b`.
@@ -77,9 +78,7 @@ impl<T: Float> Op<T> for ReflectPad {
         sink.accumulate(0, |out, accum| {
             let work = g.len();
             parallel::for_each_chunk(out, w * c, work, |i, out| {
-                if accum == Accum::Replace {
-                    out.fill(T::ZERO);
-                }
+                begin_sum(out, accum);
                 for row in images(i % h, top, h, bottom).into_iter().flatten() {
                     let g = &g.data()[(i / h * oh + row) * ow * c..][..ow * c];
                     out.iter_mut().zip(&g[left * c..]).for_each(|(d, &g)| *d += g);

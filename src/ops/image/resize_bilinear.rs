@@ -1,5 +1,6 @@
 //! Bilinear resizing.
 
+use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::pool::Buffer;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
@@ -181,9 +182,7 @@ fn columns_of<T: Float>(out: &mut [T], x: &[T], taps: &[Tap<T>], c: usize) {
 /// The transpose of that.
 #[inline(always)]
 fn gather_columns<T: Float>(out: &mut [T], accum: Accum, g: &[T], taps: &Transposed<T>, c: usize) {
-    if accum == Accum::Replace {
-        out.fill(T::ZERO);
-    }
+    begin_sum(out, accum);
     if c == 1 {
         for (x, d) in out.iter_mut().enumerate() {
             *d = taps.get(x).iter().fold(*d, |sum, &(o, weight)| weight.mul_add(g[o], sum));

@@ -1,8 +1,9 @@
 //! Nearest-neighbour enlargement by a whole factor.
 
+use crate::ops::support::squares::sum_squares;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::simd::copy_run;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
 /// Every pixel of [batch, height, width, channels] becomes a square of `scale` x `scale` pixels.
 #[derive(Clone, Copy, Debug)]
@@ -65,49 +66,6 @@ impl<T: Float> Op<T> for UpsampleNearest {
     fn backward(&self, shape: Shape, upstream: Upstream<T>, sink: &mut GradSink<T>) {
         let (g, [_, _, w, c]) = (upstream.only(), shape.nhwc().expect("checked by the shape rule"));
         sink.accumulate(0, |out, accum| sum_squares(out, accum, g.data(), [w, c], self.scale));
-    }
-}
-
-/// The sum of each square of `s` x `s` pixels of g, for an image of `w` squares a row with `c` channels.
-pub(in crate::ops) fn sum_squares<T: Float>(out: &mut [T], accum: Accum, g: &[T], [w, c]: [usize; 2], s: usize) {
-    let row = w * s * c;
-    if g.is_empty() {
-        return;
-    }
-    parallel::for_each_chunk(out, w * c, g.len(), |i, out| {
-        let g = &g[i * s * row..][..s * row];
-        simd::dispatch(
-            #[inline(always)]
-            || {
-                if s == 2 {
-                    let (top, bottom) = g.split_at(row);
-                    return sum_pairs(out, accum, top, bottom, c);
-                }
-                if accum == Accum::Replace {
-                    out.fill(T::ZERO);
-                }
-                for g in g.chunks_exact(row) {
-                    for (d, g) in out.chunks_exact_mut(c).zip(g.chunks_exact(s * c)) {
-                        for g in g.chunks_exact(c) {
-                            d.iter_mut().zip(g).for_each(|(d, &g)| *d += g);
-                        }
-                    }
-                }
-            },
-        );
-    });
-}
-
-/// The sum of each square of 2 x 2 pixels of two rows.
-#[inline(always)]
-fn sum_pairs<T: Float>(out: &mut [T], accum: Accum, top: &[T], bottom: &[T], c: usize) {
-    for ((d, a), b) in out.chunks_exact_mut(c).zip(top.chunks_exact(2 * c)).zip(bottom.chunks_exact(2 * c)) {
-        let ((a0, a1), (b0, b1)) = (a.split_at(c), b.split_at(c));
-        let terms = d.iter_mut().zip(a0.iter().zip(a1)).zip(b0.iter().zip(b1));
-        match accum {
-            Accum::Replace => terms.for_each(|((d, (&a, &b)), (&e, &f))| *d = (a + b) + (e + f)),
-            Accum::Add => terms.for_each(|((d, (&a, &b)), (&e, &f))| *d += (a + b) + (e + f)),
-        }
     }
 }
 

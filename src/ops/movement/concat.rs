@@ -1,8 +1,9 @@
 //! Concatenation along one dimension.
 
+use crate::ops::support::put::put_run;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::simd::{self, copy_run};
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
 /// The parts one after the other along dimension `axis`, in which alone they may differ.
 #[derive(Clone, Copy, Debug)]
@@ -92,10 +93,7 @@ impl<T: Float> Op<T> for Concat {
                         || {
                             for (d, g) in out.chunks_exact_mut(run).zip(g) {
                                 let g = &g[from..from + run];
-                                match accum {
-                                    Accum::Replace => copy_run(d, g),
-                                    Accum::Add => d.iter_mut().zip(g).for_each(|(d, &g)| *d += g),
-                                }
+                                put_run(accum, d, g);
                             }
                         },
                     );

@@ -1,6 +1,7 @@
 //! Reversal along an axis.
 
-use crate::ops::reduce::sum::cut;
+use crate::ops::support::axes::cut;
+use crate::ops::support::put::put_run;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
@@ -17,10 +18,7 @@ fn reversed<T: Float>(out: &mut [T], accum: Accum, x: &Tensor<T>, axis: usize) {
     parallel::for_each_chunk(out, n * inner, x.len(), |i, out| {
         let x = &x.data()[i * n * inner..][..n * inner];
         for (out, x) in out.chunks_exact_mut(inner).zip(x.chunks_exact(inner).rev()) {
-            match accum {
-                Accum::Replace => out.copy_from_slice(x),
-                Accum::Add => out.iter_mut().zip(x).for_each(|(d, &x)| *d += x),
-            }
+            put_run(accum, out, x);
         }
     });
 }

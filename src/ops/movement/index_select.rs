@@ -1,10 +1,11 @@
 //! Rows chosen by their numbers; an embedding is the same thing.
 
-use crate::ops::reduce::sum::cut;
+use crate::ops::support::axes::cut;
 use crate::ops::support::indices;
 use crate::ops::support::indices::countable;
+use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply1};
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
 /// `x [.., n, ..]`, `index [k]` -> `[.., k, ..]`: `y[.., j, ..] = x[.., index[j], ..]`, along dimension `axis`.
 ///
@@ -55,9 +56,7 @@ impl<T: Float> Op<T> for IndexSelect {
         sink.accumulate(0, |out, accum| {
             let work = g.len();
             parallel::for_each_chunk(out, n * inner, work, |o, out| {
-                if accum == Accum::Replace {
-                    out.fill(T::ZERO);
-                }
+                begin_sum(out, accum);
                 let g = &g.data()[o * k * inner..][..k * inner];
                 for (row, &i) in g.chunks_exact(inner).zip(index.data()) {
                     let to = &mut out[indices::position(i) * inner..][..inner];

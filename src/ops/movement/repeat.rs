@@ -1,8 +1,9 @@
 //! Repetition along an axis.
 
-use crate::ops::reduce::sum::cut;
+use crate::ops::support::axes::cut;
+use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
 /// The whole of dimension `axis`, `times` over: `[.., n, ..]` -> `[.., n times, ..]`, `y[i] = x[i mod n]`.
 #[derive(Clone, Copy, Debug)]
@@ -44,9 +45,7 @@ impl<T: Float> Op<T> for Repeat {
         let (run, times) = (n * inner, self.times);
         sink.accumulate(0, |out, accum| {
             parallel::for_each_chunk(out, run, g.len(), |i, out| {
-                if accum == Accum::Replace {
-                    out.fill(T::ZERO);
-                }
+                begin_sum(out, accum);
                 for g in g.data()[i * times * run..][..times * run].chunks_exact(run) {
                     out.iter_mut().zip(g).for_each(|(d, &g)| *d += g);
                 }

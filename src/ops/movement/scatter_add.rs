@@ -3,8 +3,9 @@
 use super::gather::fits;
 use crate::ops::support::indices;
 use crate::ops::support::indices::countable;
+use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply1};
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 
 /// `x`, `index`, `values` -> `y` in the shape of x, which is x with the values added where the index points: along
 /// dimension 1 of three, `y[i, index[i, j, k], k] += values[i, j, k]`.
@@ -55,9 +56,7 @@ impl<T: Float> Op<T> for ScatterAdd {
     fn backward(&self, (index, values): Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
         let g = upstream.only();
         sink.accumulate(2, |out, accum| {
-            if accum == Accum::Replace {
-                out.fill(T::ZERO);
-            }
+            begin_sum(out, accum);
             let to = indices::walk(*index.shape(), values.strides());
             for (from, to) in indices::pointed(&index, g.shape(), self.axis).zip(to) {
                 out[to] += g.data()[from];

@@ -2,8 +2,9 @@
 
 use std::ops::Range;
 
+use crate::ops::support::put::{begin_sum, put_run};
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
 /// The elements `start..end` of dimension `axis`.
 #[derive(Clone, Copy, Debug)]
@@ -74,22 +75,15 @@ impl<T: Float> Op<T> for Slice {
         sink.accumulate(0, |out, accum| {
             let (tile, work) = (self.tile(run), out.len());
             if range.is_empty() {
-                if accum == Accum::Replace {
-                    out.fill(T::ZERO);
-                }
+                begin_sum(out, accum);
                 return;
             }
             parallel::for_each_chunk(out, tile * run, work, |i, out| {
                 let g = g.data()[i * tile * range.len()..].chunks_exact(range.len());
                 for (d, g) in out.chunks_exact_mut(run).zip(g) {
-                    match accum {
-                        Accum::Replace => {
-                            d[..range.start].fill(T::ZERO);
-                            d[range.clone()].copy_from_slice(g);
-                            d[range.end..].fill(T::ZERO);
-                        }
-                        Accum::Add => d[range.clone()].iter_mut().zip(g).for_each(|(d, &g)| *d += g),
-                    }
+                    begin_sum(&mut d[..range.start], accum);
+                    put_run(accum, &mut d[range.clone()], g);
+                    begin_sum(&mut d[range.end..], accum);
                 }
             });
         });

@@ -2,7 +2,7 @@
 
 use std::cmp::Ordering;
 
-use crate::ops::reduce::sum::cut;
+use crate::ops::support::axes::cut;
 use crate::ops::support::indices;
 use crate::ops::support::indices::countable;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply};

@@ -4,11 +4,13 @@
 //! Everything is a loop over rows of C channels. So that few channels vectorise as well as many, a row is read together
 //! with its followers, up to a `width` that is a multiple of the channels, and per-channel numbers are repeated to it.
 
-use crate::ops::elementwise::unary::{Elu, Function, Hardswish, Relu};
-use crate::ops::support::epilogue::{repeat, width};
+use crate::ops::elementwise::unary::Function;
+use crate::ops::support::epilogue::{repeat, width, with_activation};
+use crate::ops::support::put::put;
+use crate::ops::support::sums::add_sums;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply, apply1};
 use crate::tensor::pool::Buffer;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
 pub use crate::ops::support::epilogue::Activation;
 
@@ -108,60 +110,6 @@ fn statistics<T: Float>(x: &[T], c: usize, tile: usize) -> (Vec<f64>, Vec<f64>) 
     (mean, squares)
 }
 
-/// An activation as the kernels take it.
-/// Its derivative comes from its argument, which is computed again.
-trait Fused: Copy + Send + Sync {
-    fn f<T: Float>(self, x: T) -> T;
-    fn df<T: Float>(self, x: T) -> T;
-}
-
-#[derive(Clone, Copy)]
-struct Plain;
-
-impl Fused for Plain {
-    #[inline(always)]
-    fn f<T: Float>(self, x: T) -> T {
-        x
-    }
-    #[inline(always)]
-    fn df<T: Float>(self, _: T) -> T {
-        T::ONE
-    }
-}
-
-impl Fused for Relu {
-    #[inline(always)]
-    fn f<T: Float>(self, x: T) -> T {
-        Function::f(self, x)
-    }
-    #[inline(always)]
-    fn df<T: Float>(self, x: T) -> T {
-        Function::df(self, x)
-    }
-}
-
-impl Fused for Hardswish {
-    #[inline(always)]
-    fn f<T: Float>(self, x: T) -> T {
-        Function::f(self, x)
-    }
-    #[inline(always)]
-    fn df<T: Float>(self, x: T) -> T {
-        Function::df(self, x)
-    }
-}
-
-impl Fused for Elu {
-    #[inline(always)]
-    fn f<T: Float>(self, x: T) -> T {
-        Function::f(self, x)
-    }
-    #[inline(always)]
-    fn df<T: Float>(self, x: T) -> T {
-        Function::df(self, Function::f(self, x))
-    }
-}
-
 /// weight / sqrt(var + eps).
 fn scale<T: Float>(weight: &[T], rstd: &[T]) -> Vec<T> {
     weight.iter().zip(rstd).map(|(&w, &r)| w * r).collect()
@@ -171,16 +119,12 @@ fn rstd<T: Float>(var: impl IntoIterator<Item = f64>, eps: f64) -> Vec<T> {
     var.into_iter().map(|v| T::of(1.0 / (v + eps).sqrt())).collect()
 }
 
+/// `act((x - mean) scale + bias)`.
 fn normalise<T: Float>(s: &Saved<T>, activation: Activation, tile: usize) -> Tensor<T> {
-    match activation {
-        Activation::None => normalise_with(s, Plain, tile),
-        Activation::Relu => normalise_with(s, Relu, tile),
-        Activation::Hardswish => normalise_with(s, Hardswish, tile),
-        Activation::Elu => normalise_with(s, Elu, tile),
-    }
+    with_activation!(activation, |f| normalise_with(s, f, tile))
 }
 
-fn normalise_with<T: Float>(s: &Saved<T>, act: impl Fused, tile: usize) -> Tensor<T> {
+fn normalise_with<T: Float>(s: &Saved<T>, act: impl Function, tile: usize) -> Tensor<T> {
     let c = s.x.shape().last();
     let (chunk, width) = (tile * c, width(c));
     let [mean, scale, bias] =
@@ -217,17 +161,12 @@ fn backward<T: Float>(
     g: Tensor<T>,
     sink: &mut GradSink<T>,
 ) {
-    match activation {
-        Activation::None => backward_with(s, Plain, tile, moving, g, sink),
-        Activation::Relu => backward_with(s, Relu, tile, moving, g, sink),
-        Activation::Hardswish => backward_with(s, Hardswish, tile, moving, g, sink),
-        Activation::Elu => backward_with(s, Elu, tile, moving, g, sink),
-    }
+    with_activation!(activation, |f| backward_with(s, f, tile, moving, g, sink))
 }
 
 fn backward_with<T: Float>(
     s: Saved<T>,
-    act: impl Fused,
+    act: impl Function,
     tile: usize,
     moving: bool,
     g: Tensor<T>,
@@ -257,7 +196,7 @@ fn backward_with<T: Float>(
                         let sums = plain.iter_mut().zip(centred.iter_mut());
                         for (((p, q), (&x, &g)), ((&m, &s), &b)) in sums.zip(x.iter().zip(g)).zip(lanes) {
                             let d = x - m;
-                            let dz = g * act.df(d.mul_add(s, b));
+                            let dz = g * act.slope(d.mul_add(s, b));
                             *p += dz;
                             *q = dz.mul_add(d, *q);
                         }
@@ -293,16 +232,13 @@ fn backward_with<T: Float>(
                     for (out, (x, g)) in out.chunks_mut(width).zip(x.chunks(width).zip(g.chunks(width))) {
                         let lanes = mean_l.iter().zip(scale_l.iter()).zip(bias_l.iter());
                         let terms = out.iter_mut().zip(x.iter().zip(g)).zip(lanes.zip(shift.iter().zip(slope.iter())));
-                        match accum {
-                            Accum::Replace => terms.for_each(|((o, (&x, &g)), (((&m, &s), &b), (&p, &q)))| {
+                        put(
+                            accum,
+                            terms.map(|((o, (&x, &g)), (((&m, &s), &b), (&p, &q)))| {
                                 let d = x - m;
-                                *o = (g * act.df(d.mul_add(s, b))).mul_add(s, -d.mul_add(q, p));
+                                (o, (g * act.slope(d.mul_add(s, b))).mul_add(s, -d.mul_add(q, p)))
                             }),
-                            Accum::Add => terms.for_each(|((o, (&x, &g)), (((&m, &s), &b), (&p, &q)))| {
-                                let d = x - m;
-                                *o += (g * act.df(d.mul_add(s, b))).mul_add(s, -d.mul_add(q, p));
-                            }),
-                        }
+                        );
                     }
                 },
             );
@@ -310,17 +246,6 @@ fn backward_with<T: Float>(
     });
     add_sums(sink, 1, &dweight);
     add_sums(sink, 2, &dbias);
-}
-
-/// Hands over the gradient of a parameter, summed in f64.
-pub(in crate::ops) fn add_sums<T: Float>(sink: &mut GradSink<T>, i: usize, sums: &[f64]) {
-    sink.accumulate(i, |out, accum| {
-        let terms = out.iter_mut().zip(sums);
-        match accum {
-            Accum::Replace => terms.for_each(|(o, &s)| *o = T::of(s)),
-            Accum::Add => terms.for_each(|(o, &s)| *o += T::of(s)),
-        }
-    });
 }
 
 /// The channels, if vectors of as many numbers stand beside a nonempty x.

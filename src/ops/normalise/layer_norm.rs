@@ -2,11 +2,12 @@
 
 use pulp::{Simd, WithSimd};
 
-use super::batch_norm::add_sums;
+use crate::ops::support::put::put;
+use crate::ops::support::sums::{add_sums, sum_of_pairs};
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::pool::Buffer;
 use crate::tensor::simd::dispatch_vector;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
 /// `y = (x - mean) / sqrt(var + eps) * weight + bias`, mean and biased variance of each row of x [.., C] (Ba, Kiros and
 /// Hinton, 1607.06450).
@@ -22,31 +23,6 @@ pub struct LayerNorm {
 pub struct Saved<T: Float> {
     x: Tensor<T>,
     weight: Tensor<T>,
-}
-
-/// Elements summed side by side.
-const LANES: usize = 16;
-
-/// The sum of `f` over two rows, in [`LANES`] partial sums.
-#[inline(always)]
-pub(in crate::ops) fn sum<T: Float>(a: &[T], b: &[T], f: impl Fn(T, T) -> T) -> T {
-    let mut sums = [T::ZERO; LANES];
-    let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
-    for (a, b) in a.iter().zip(b) {
-        for (s, (&a, &b)) in sums.iter_mut().zip(a.iter().zip(b)) {
-            *s += f(a, b);
-        }
-    }
-    for (s, (&a, &b)) in sums.iter_mut().zip(a_rest.iter().zip(b_rest)) {
-        *s += f(a, b);
-    }
-    let mut half = LANES / 2;
-    while half > 0 {
-        let (left, right) = sums.split_at_mut(half);
-        left.iter_mut().zip(right).for_each(|(l, &mut r)| *l += r);
-        half /= 2;
-    }
-    sums[0]
 }
 
 /// Mean and 1 / sqrt(var + eps) of every row of x, in two passes over it.
@@ -160,17 +136,10 @@ impl<T: Float> Op<T> for LayerNorm {
                         let rows = x.chunks_exact(c).zip(g.chunks_exact(c)).zip(&moments);
                         for (out, ((x, g), &[mean, rstd])) in out.chunks_exact_mut(c).zip(rows) {
                             products.iter_mut().zip(g.iter().zip(weight)).for_each(|(u, (&g, &w))| *u = g * w);
-                            let level = sum(&products, x, |u, _| u) * share;
-                            let slope = sum(&products, x, |u, x| u * (x - mean)) * share * rstd * rstd;
+                            let level = sum_of_pairs(&products, x, |u, _| u) * share;
+                            let slope = sum_of_pairs(&products, x, |u, x| u * (x - mean)) * share * rstd * rstd;
                             let terms = out.iter_mut().zip(products.iter().zip(x));
-                            match accum {
-                                Accum::Replace => {
-                                    terms.for_each(|(o, (&u, &x))| *o = (u - level - (x - mean) * slope) * rstd)
-                                }
-                                Accum::Add => {
-                                    terms.for_each(|(o, (&u, &x))| *o += (u - level - (x - mean) * slope) * rstd)
-                                }
-                            }
+                            put(accum, terms.map(|(o, (&u, &x))| (o, (u - level - (x - mean) * slope) * rstd)));
                         }
                     },
                 );

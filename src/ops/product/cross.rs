@@ -1,5 +1,6 @@
 //! The cross product of vectors.
 
+use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 
@@ -12,10 +13,7 @@ fn products<T: Float>(out: &mut [T], accum: Accum, a: &[T], b: &[T]) {
     let vectors = a.as_chunks::<3>().0.iter().zip(b.as_chunks::<3>().0);
     for (out, (a, b)) in out.as_chunks_mut::<3>().0.iter_mut().zip(vectors) {
         let product = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-        match accum {
-            Accum::Replace => *out = product,
-            Accum::Add => out.iter_mut().zip(product).for_each(|(d, p)| *d += p),
-        }
+        put(accum, out.iter_mut().zip(product));
     }
 }
 

@@ -2,10 +2,13 @@
 
 use crate::ops::elementwise::unary::{Function, Gelu};
 use crate::ops::support::epilogue::{Activation, Finish};
+use crate::ops::support::put::put;
+use crate::ops::support::row_products::{forward, input_gradient, product, tile_rows, weight_gradient};
+use crate::ops::support::sums::bias_gradient;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::gemm::Rows;
 use crate::tensor::pool::Buffer;
-use crate::tensor::register_tile::{Gram, Line, Panels, Product};
+use crate::tensor::register_tile::Panels;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
 /// `y [.., out] = x [.., in] w [in, out] (+ b [out])`. A 1x1 convolution is the same thing.
@@ -16,26 +19,6 @@ pub struct Linear {
     pub gelu: bool,
     /// Rows handed to a thread at a time; chosen by shape if 0. A gradient check shrinks it to reach tile edges.
     pub tile: usize,
-}
-
-/// Rows a tile: about 2^17 multiplications, at least 40 rows; or `tile`, if that is given.
-fn tile_rows(tile: usize, k: usize, n: usize) -> usize {
-    if tile > 0 { tile } else { ((1 << 17) / (k * n).max(1)).clamp(40, 1000).next_multiple_of(20) }
-}
-
-/// `out = x w`, finished; x may come in parts, whose columns stand side by side.
-pub(in crate::ops) fn forward<T: Float>(out: &mut [T], parts: &[Rows<T>], w: &[T], finish: &Finish<T>, tile: usize) {
-    let k = parts.iter().map(|x| x.cols).sum();
-    let n = out.len() / parts[0].rows.max(1);
-    let tile = tile_rows(tile, k, n);
-    let work = 2 * out.len() * k;
-    let panels = Panels::dense(w, k, n, parts[0].rows);
-    parallel::for_each_chunk(out, tile * n, work, |i, out| {
-        let rows = out.len() / n;
-        let lines: Vec<Line<T>> = parts.iter().map(|x| line(x.rows(i * tile, rows))).collect();
-        Product { out, out_step: n, accum: Accum::Replace, lines: &lines, panels: &panels }.run();
-        finish.run(out);
-    });
 }
 
 /// `to = gelu(from)`.
@@ -85,40 +68,9 @@ fn input_gradient_of_gelu<T: Float>(out: &mut [T], accum: Accum, x: &[T], dy: Ro
         let terms = dh.iter().zip(&x[i * tile * k..]);
         simd::dispatch(
             #[inline(always)]
-            || match accum {
-                Accum::Replace => out.iter_mut().zip(terms).for_each(|(d, (&dh, &x))| *d = dh * Gelu.df(x)),
-                Accum::Add => out.iter_mut().zip(terms).for_each(|(d, (&dh, &x))| *d += dh * Gelu.df(x)),
-            },
+            || put(accum, out.iter_mut().zip(terms).map(|(d, (&dh, &x))| (d, dh * Gelu.df(x)))),
         );
     });
-}
-
-/// `dx = dy w^T`.
-pub(crate) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, dy: Rows<T>, w: &[T], tile: usize) {
-    let n = dy.cols;
-    let k = out.len() / dy.rows.max(1);
-    let tile = tile_rows(tile, k, n);
-    let work = 2 * out.len() * n;
-    let panels = Panels::transposed(w, n, k);
-    parallel::for_each_chunk(out, tile * k, work, |i, out| {
-        let rows = out.len() / k;
-        product(out, accum, dy.rows(i * tile, rows), &panels);
-    });
-}
-
-/// `out = x panels`, or added to what is there.
-fn product<T: Float>(out: &mut [T], accum: Accum, x: Rows<T>, panels: &Panels<T>) {
-    Product { out, out_step: panels.cols(), accum, lines: &[line(x)], panels }.run();
-}
-
-/// Rows as the left operand of a product.
-fn line<T: Float>(x: Rows<'_, T>) -> Line<'_, T> {
-    Line { data: x.data, step: x.row_stride, run: x.cols }
-}
-
-/// How many partial sums a weight gradient is made of: depends on the shape alone.
-fn partials(rows: usize) -> usize {
-    rows.div_ceil(256).clamp(1, 8)
 }
 
 impl<T: Float> Op<T> for Linear {
@@ -180,81 +132,8 @@ impl<T: Float> Op<T> for Linear {
                 weight_gradient(out, accum, Rows::dense(h.data(), rows, k), dy);
             });
         }
-        sink.accumulate(2, |out, accum| bias_gradient(out, accum, g.data()));
+        sink.accumulate(2, |out, accum| bias_gradient(out, accum, dy));
     }
-}
-
-/// Rows of a product that adds to a weight's gradient.
-const ROWS: usize = 512;
-
-/// `dw = x^T dy` in a fixed number of partial sums, added up in order: the same bits for any number of threads.
-pub(crate) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, x: Rows<T>, g: Rows<T>) {
-    let (rows, k, n) = (x.rows, x.cols, g.cols);
-    let parts = partials(rows);
-    let step = rows.div_ceil(parts).max(1);
-    let product = |part: usize, out: &mut [T], accum| {
-        let (from, to) = ((part * step).min(rows), ((part + 1) * step).min(rows));
-        if accum == Accum::Replace {
-            out.fill(T::ZERO);
-        }
-        // Sums of sums, as far as rounding goes; and what a product reads stays in the cache.
-        for first in (from..to).step_by(ROWS) {
-            let count = ROWS.min(to - first);
-            let (a_step, b_step) = (x.row_stride, g.row_stride);
-            let terms = &[(x.rows(first, count).data, g.rows(first, count).data)];
-            Gram { out, out_step: n, rows: k, cols: n, terms, count, a_step, b_step }.run();
-        }
-    };
-    if parts == 1 {
-        return product(0, out, accum);
-    }
-    let sums =
-        parallel::map(parts, 2 * rows * k * n, |part| Tensor::build([k, n], |out| product(part, out, Accum::Replace)));
-    sum_into(out, accum, &sums);
-}
-
-/// Adds up partial sums in order.
-pub(crate) fn sum_into<T: Float>(out: &mut [T], accum: Accum, parts: &[Tensor<T>]) {
-    const CHUNK: usize = 1 << 14;
-    let work = out.len() * parts.len();
-    parallel::for_each_chunk(out, CHUNK, work, |i, out| {
-        let range = i * CHUNK..i * CHUNK + out.len();
-        let mut parts = parts.iter().map(|part| &part.data()[range.clone()]);
-        simd::dispatch(
-            #[inline(always)]
-            || {
-                if accum == Accum::Replace {
-                    match parts.next() {
-                        Some(first) => out.copy_from_slice(first),
-                        None => out.fill(T::ZERO),
-                    }
-                }
-                for part in parts {
-                    out.iter_mut().zip(part).for_each(|(s, &x)| *s += x);
-                }
-            },
-        );
-    });
-}
-
-/// The sum of the rows of `g`, in blocks: the same bits for any number of threads.
-pub(crate) fn bias_gradient<T: Float>(out: &mut [T], accum: Accum, g: &[T]) {
-    let n = out.len();
-    if n == 0 {
-        return;
-    }
-    const BLOCK: usize = 256;
-    let rows = g.len() / n;
-    let blocks = parallel::map(rows.div_ceil(BLOCK), g.len(), |i| {
-        let rows = &g[i * BLOCK * n..((i + 1) * BLOCK).min(rows) * n];
-        Tensor::build([n], |sum| {
-            sum.fill(T::ZERO);
-            for row in rows.chunks_exact(n) {
-                sum.iter_mut().zip(row).for_each(|(s, &g)| *s += g);
-            }
-        })
-    });
-    sum_into(out, accum, &blocks);
 }
 
 impl Checked for Linear {

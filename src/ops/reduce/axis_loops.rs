@@ -4,8 +4,9 @@
 //! and a column for each index of the dimensions after it. A reduction leaves one number for each column of each block.
 //! Along the last dimension a block has a single column, which is contiguous.
 
-use super::sum::{cut, sum_rows};
+use crate::ops::support::axes::cut;
 use crate::ops::support::put::put;
+use crate::ops::support::sums::sum_rows;
 use crate::tensor::pool::Buffer;
 use crate::tensor::{Accum, Float, Shape, parallel, simd};
 
@@ -38,6 +39,16 @@ impl Blocks {
     /// Elements of a block.
     pub fn len(&self) -> usize {
         self.run * self.inner
+    }
+
+    /// One block of `x`.
+    pub fn block<'a, T>(&self, o: usize, x: &'a [T]) -> &'a [T] {
+        &x[o * self.len()..][..self.len()]
+    }
+
+    /// The rows of one block of `x`. There has to be a column.
+    pub fn rows<'a, T>(&self, o: usize, x: &'a [T]) -> std::slice::ChunksExact<'a, T> {
+        self.block(o, x).chunks_exact(self.inner)
     }
 
     /// Columns of all blocks.
@@ -95,9 +106,7 @@ impl Blocks {
             out,
             0,
             #[inline(always)]
-            |o, out, _| {
-                map(out, accum, &x[o * self.len()..][..self.len()], &columns[o * self.inner..][..self.inner], &f)
-            },
+            |o, out, _| map(out, accum, self.block(o, x), &columns[o * self.inner..][..self.inner], &f),
         );
     }
 
@@ -115,7 +124,7 @@ impl Blocks {
             self.len(),
             #[inline(always)]
             |o, sums, terms| {
-                let x = &x[o * self.len()..][..self.len()];
+                let x = self.block(o, x);
                 map(terms, Accum::Replace, x, &columns[o * self.inner..][..self.inner], &f);
                 sum_rows(sums, terms);
             },
@@ -138,7 +147,7 @@ impl Blocks {
             0,
             #[inline(always)]
             |o, folded, _| {
-                let (x, columns) = (&x[o * self.len()..][..self.len()], &columns[o * self.inner..][..self.inner]);
+                let (x, columns) = (self.block(o, x), &columns[o * self.inner..][..self.inner]);
                 folded.fill(start);
                 if let ([y], [c]) = (&mut *folded, columns) {
                     *y = x.iter().fold(*y, |y, &x| f(y, x, *c));

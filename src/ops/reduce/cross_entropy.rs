@@ -2,8 +2,8 @@
 
 use super::axis_loops::Blocks;
 use super::log_sum_exp::{log_sums, maxima};
-use super::sum::pairwise_sum;
 use crate::ops::support::put::put;
+use crate::ops::support::sums::pairwise_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::pool::Buffer;
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};

@@ -1,7 +1,7 @@
 //! The logarithm of a sum of exponentials: the smooth maximum.
 
 use super::axis_loops::Blocks;
-use super::sum::dropped;
+use crate::ops::support::axes::dropped;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::pool::Buffer;
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};

@@ -1,9 +1,9 @@
 //! Euclidean lengths, and vectors brought to length 1.
 
 use super::axis_loops::Blocks;
-use super::sum::dropped;
-use crate::ops::normalise::layer_norm::sum;
+use crate::ops::support::axes::dropped;
 use crate::ops::support::put::put;
+use crate::ops::support::sums::sum_of_pairs;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::pool::Buffer;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
@@ -150,7 +150,7 @@ impl<T: Float> Op<T> for L2Normalize {
                 |o, out, _| {
                     let [y, g] = [&y, &g].map(|t| &t.data()[o * blocks.run..][..blocks.run]);
                     let (d, free) = self.divisor(lengths[o]);
-                    let along = if free { sum(y, g, |y, g| y * g) } else { T::ZERO };
+                    let along = if free { sum_of_pairs(y, g, |y, g| y * g) } else { T::ZERO };
                     put(accum, out.iter_mut().zip(y.iter().zip(g).map(|(&y, &g)| (g - y * along) / d)));
                 },
             );

@@ -1,7 +1,7 @@
 //! Products along dimensions.
 
 use super::axis_loops::Blocks;
-use super::sum::dropped;
+use crate::ops::support::axes::dropped;
 use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};

@@ -1,8 +1,9 @@
 //! Softmax along any axis.
 
+use super::axis_loops::Blocks;
+use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
-use crate::tensor::pool::Buffer;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 
 /// `y = e^(x - max) / sum e^(x - max)`, maximum and sum along an axis. Where all of them are minus infinity (or one is
 /// plus infinity or NaN) the result is NaN.
@@ -10,12 +11,6 @@ use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parall
 pub struct Softmax {
     /// The axis along which the result sums to 1.
     pub axis: usize,
-}
-
-/// What stands before the axis, its extent, and what comes after.
-fn cut(shape: &Shape, axis: usize) -> [usize; 3] {
-    let d = shape.dims();
-    [d[..axis].iter().product(), d[axis], d[axis + 1..].iter().product()]
 }
 
 impl<T: Float> Op<T> for Softmax {
@@ -30,30 +25,22 @@ impl<T: Float> Op<T> for Softmax {
     }
 
     fn algo(&self, inputs: &[Shape]) -> &'static str {
-        if cut(&inputs[0], self.axis)[2] == 1 { "last_axis" } else { "inner_axis" }
+        Blocks::of(&inputs[0], self.axis, 1).algo()
     }
 
     fn forward(&self, inputs: &[&Tensor<T>], needs: &Needs) -> (Vec<Tensor<T>>, Self::Saved) {
         let x = inputs[0];
-        let [_, n, inner] = cut(x.shape(), self.axis);
-        let chunk = if inner == 1 { n * (1usize << 12).div_ceil(n.max(1)) } else { n * inner };
+        let blocks = Blocks::of(x.shape(), self.axis, 1);
         let y = Tensor::build(*x.shape(), |out| {
-            let work = 16 * out.len();
-            parallel::for_each_chunk(out, chunk, work, |i, out| {
-                let x = &x.data()[i * chunk..][..out.len()];
-                if inner == 1 {
-                    simd::dispatch(
-                        #[inline(always)]
-                        || out.chunks_exact_mut(n).zip(x.chunks_exact(n)).for_each(|(y, x)| row(y, x)),
-                    );
-                } else {
-                    let mut scratch = Buffer::stale(inner);
-                    simd::dispatch(
-                        #[inline(always)]
-                        || columns(out, x, &mut scratch),
-                    );
-                }
-            });
+            blocks.for_each(
+                out,
+                blocks.inner,
+                #[inline(always)]
+                |o, y, scratch| {
+                    let x = blocks.block(o, x.data());
+                    if blocks.inner == 1 { row(y, x) } else { columns(y, x, scratch) }
+                },
+            );
         });
         let saved = needs.any().then(|| y.clone());
         (vec![y], saved)
@@ -62,35 +49,24 @@ impl<T: Float> Op<T> for Softmax {
     /// dx = y (dy - sum dy y), the sum along the axis.
     fn backward(&self, saved: Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
         let (y, g) = (saved.expect("saved for a wanted gradient"), upstream.only());
-        let [_, n, inner] = cut(y.shape(), self.axis);
-        let chunk = if inner == 1 { n * (1usize << 12).div_ceil(n.max(1)) } else { n * inner };
-        let inner = inner.max(1);
+        let blocks = Blocks::of(y.shape(), self.axis, 1);
         sink.accumulate(0, |out, accum| {
-            let work = 6 * out.len();
-            parallel::for_each_chunk(out, chunk, work, |i, out| {
-                let (y, g) = (&y.data()[i * chunk..][..out.len()], &g.data()[i * chunk..][..out.len()]);
-                let mut sums = Buffer::stale(inner);
-                simd::dispatch(
-                    #[inline(always)]
-                    || {
-                        let slices = y.chunks_exact(n * inner).zip(g.chunks_exact(n * inner));
-                        for (out, (y, g)) in out.chunks_exact_mut(n * inner).zip(slices) {
-                            sums.fill(T::ZERO);
-                            for (y, g) in y.chunks_exact(inner).zip(g.chunks_exact(inner)) {
-                                sums.iter_mut().zip(y.iter().zip(g)).for_each(|(s, (&y, &g))| *s = y.mul_add(g, *s));
-                            }
-                            let rows = y.chunks_exact(inner).zip(g.chunks_exact(inner));
-                            for (out, (y, g)) in out.chunks_exact_mut(inner).zip(rows) {
-                                let terms = out.iter_mut().zip(y.iter().zip(g).zip(sums.iter()));
-                                match accum {
-                                    Accum::Replace => terms.for_each(|(o, ((&y, &g), &s))| *o = y * (g - s)),
-                                    Accum::Add => terms.for_each(|(o, ((&y, &g), &s))| *o += y * (g - s)),
-                                }
-                            }
-                        }
-                    },
-                );
-            });
+            blocks.for_each(
+                out,
+                blocks.inner,
+                #[inline(always)]
+                |o, out, sums| {
+                    let rows = || blocks.rows(o, y.data()).zip(blocks.rows(o, g.data()));
+                    sums.fill(T::ZERO);
+                    for (y, g) in rows() {
+                        sums.iter_mut().zip(y.iter().zip(g)).for_each(|(s, (&y, &g))| *s = y.mul_add(g, *s));
+                    }
+                    for (out, (y, g)) in out.chunks_exact_mut(blocks.inner).zip(rows()) {
+                        let terms = out.iter_mut().zip(y.iter().zip(g).zip(sums.iter()));
+                        put(accum, terms.map(|(o, ((&y, &g), &s))| (o, y * (g - s))));
+                    }
+                },
+            );
         });
     }
 }

@@ -1,9 +1,12 @@
 //! Sums, means and extremes along dimensions.
 
+use crate::ops::support::axes::{cut, dropped};
 use crate::ops::support::indices::countable;
+use crate::ops::support::put::{begin_sum, put};
+use crate::ops::support::sums::sum_rows;
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply, apply1};
 use crate::tensor::pool::Buffer;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
 /// The sum over a run of dimensions `first..first + count`, times a factor (one over their size makes a mean).
 /// The dimensions are dropped.
@@ -15,21 +18,6 @@ pub struct Sum {
     pub count: usize,
     /// Whether the result is divided by the number of summands.
     pub mean: bool,
-}
-
-/// A shape cut in three: what stands before the reduced dimensions, they themselves, and what comes after.
-pub(in crate::ops) fn cut(shape: &Shape, first: usize, count: usize) -> [usize; 3] {
-    let d = shape.dims();
-    [d[..first].iter().product(), d[first..first + count].iter().product(), d[first + count..].iter().product()]
-}
-
-/// The shape without the run of dimensions.
-pub(in crate::ops) fn dropped(shape: &Shape, first: usize, count: usize) -> Result<Vec<Shape>, ShapeError> {
-    if first + count > shape.rank() {
-        return Err(ShapeError::new(format!("no dimensions {first}..{}", first + count)));
-    }
-    let d = shape.dims();
-    Ok(vec![Shape::new(&[&d[..first], &d[first + count..]].concat())])
 }
 
 impl Sum {
@@ -82,10 +70,7 @@ impl<T: Float> Op<T> for Sum {
                     || {
                         for out in out.chunks_mut(inner) {
                             let terms = out.iter_mut().zip(g);
-                            match accum {
-                                Accum::Replace => terms.for_each(|(d, &g)| *d = g * factor),
-                                Accum::Add => terms.for_each(|(d, &g)| *d += g * factor),
-                            }
+                            put(accum, terms.map(|(d, &g)| (d, g * factor)));
                         }
                     },
                 );
@@ -116,63 +101,6 @@ fn sum_each<T: Float>(out: &mut [T], x: &[T], n: usize, inner: usize) {
     for (out, parts) in out.chunks_mut(inner).zip(parts.chunks(PARTS * inner)) {
         sum_rows(out, parts);
     }
-}
-
-/// Sums in blocks, and the blocks in pairs: the error grows with the logarithm of the length.
-pub(crate) fn pairwise_sum<T: Float>(x: &[T]) -> T {
-    const BLOCK: usize = 256;
-    if x.len() <= BLOCK {
-        // Eight sums side by side, which vectorise.
-        let mut sums = [T::ZERO; 8];
-        let (eights, rest) = x.as_chunks::<8>();
-        for eight in eights {
-            for (s, &x) in sums.iter_mut().zip(eight) {
-                *s += x;
-            }
-        }
-        return sums.into_iter().sum::<T>() + rest.iter().copied().sum::<T>();
-    }
-    let (left, right) = x.split_at((x.len() / 2).next_multiple_of(BLOCK));
-    pairwise_sum(left) + pairwise_sum(right)
-}
-
-/// The sum of the rows of a matrix, in blocks that are then summed in pairs.
-pub(in crate::ops) fn sum_rows<T: Float>(out: &mut [T], x: &[T]) {
-    simd::dispatch(
-        #[inline(always)]
-        || sum_rows_here(out, x),
-    );
-}
-
-#[inline(always)]
-fn sum_rows_here<T: Float>(out: &mut [T], x: &[T]) {
-    const BLOCK: usize = 64;
-    if let [sum] = out {
-        *sum = pairwise_sum(x);
-        return;
-    }
-    let (cols, rows) = (out.len(), x.len() / out.len());
-    out.fill(T::ZERO);
-    if rows <= BLOCK {
-        // Four rows at a time: each addition to `out` waits for the one before.
-        let mut fours = x.chunks_exact(4 * cols);
-        for four in &mut fours {
-            let (first, last) = four.split_at(2 * cols);
-            let (a, b) = first.split_at(cols);
-            let (c, d) = last.split_at(cols);
-            let rows = a.iter().zip(b).zip(c.iter().zip(d));
-            out.iter_mut().zip(rows).for_each(|(s, ((&a, &b), (&c, &d)))| *s += (a + b) + (c + d));
-        }
-        for row in fours.remainder().chunks_exact(cols) {
-            out.iter_mut().zip(row).for_each(|(s, &x)| *s += x);
-        }
-        return;
-    }
-    let (left, right) = x.split_at((rows / 2).next_multiple_of(BLOCK) * cols);
-    sum_rows(out, left);
-    let mut other = vec![T::ZERO; cols];
-    sum_rows(&mut other, right);
-    out.iter_mut().zip(other).for_each(|(s, x)| *s += x);
 }
 
 impl Checked for Sum {
@@ -290,9 +218,7 @@ where
         let g = upstream.only();
         let [_, n, inner] = cut(&shape, self.first, self.count);
         sink.accumulate(0, |out, accum| {
-            if accum == Accum::Replace {
-                out.fill(T::ZERO);
-            }
+            begin_sum(out, accum);
             for (i, (&g, k)) in g.data().iter().zip(index.data()).enumerate() {
                 out[((i / inner) * n + k.f64() as usize) * inner + i % inner] += g;
             }

@@ -2,7 +2,7 @@
 
 use super::axis_loops::Blocks;
 use super::norm::lengths;
-use super::sum::dropped;
+use crate::ops::support::axes::dropped;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::pool::Buffer;
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};

@@ -2,56 +2,119 @@
 //!
 //! A pass over memory of its own would cost as much as the arithmetic of a small convolution.
 
-use crate::ops::elementwise::unary::{Elu, Function, Hardswish, Relu};
+use crate::ops::Case;
+pub(in crate::ops) use crate::ops::elementwise::unary::{Elu, Hardswish, Relu};
+use crate::ops::elementwise::unary::{Function, Unary};
 use crate::tensor::pool::Buffer;
 use crate::tensor::{Float, Tensor, parallel, simd};
 
-/// An activation that an op applies in the same pass over memory.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Activation {
+/// Makes everything that has a line for each activation: the enum, and the two macros that go through it. A new
+/// activation is a [`Function`] and its line in the list below: its variant, that function, its name, and what it adds
+/// to the name of a kernel path.
+macro_rules! activations {
+    ($d:tt $($(#[$note:meta])* $variant:ident = $function:ident, $name:literal, $suffix:literal;)*) => {
+        /// An activation that an op applies in the same pass over memory.
+        #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+        pub enum Activation {
+            $($(#[$note])* $variant,)*
+        }
+
+        /// How many there are.
+        const COUNT: usize = [$($name),*].len();
+
+        impl Activation {
+            /// All of them.
+            pub(in crate::ops) const ALL: [Activation; COUNT] = [$(Activation::$variant),*];
+
+            /// A name for kernel paths.
+            pub(in crate::ops) fn name(self) -> &'static str {
+                [$($name),*][self as usize]
+            }
+
+            /// Whether the derivative follows from the result alone, so that the argument need not be kept.
+            pub(in crate::ops) fn follows_from_result(self) -> bool {
+                [$($function::FROM_RESULT),*][self as usize]
+            }
+        }
+
+        /// `with_activation!(activation, |f| body)`: the body, with `f` the [`Function`] of the activation.
+        macro_rules! with_activation {
+            ($d activation:expr, |$d f:ident| $d body:expr) => {
+                match $d activation {
+                    $($crate::ops::support::epilogue::Activation::$variant => {
+                        let $d f = $crate::ops::support::epilogue::$function;
+                        $d body
+                    })*
+                }
+            };
+        }
+
+        /// A kernel path's names, one for each activation behind it: for [`Activation::among`].
+        macro_rules! paths {
+            ($d path:literal) => {
+                [$(concat!($d path, $suffix)),*]
+            };
+        }
+    };
+}
+
+activations! { $
     /// Nothing.
     #[default]
-    None,
+    None = Identity, "plain", "";
     /// max(x, 0).
-    Relu,
+    Relu = Relu, "relu", "_relu";
     /// x clamp(x + 3, 0, 6) / 6.
-    Hardswish,
+    Hardswish = Hardswish, "hardswish", "_hardswish";
     /// x where x > 0, else e^x - 1.
-    Elu,
+    Elu = Elu, "elu", "_elu";
+}
+pub(in crate::ops) use {paths, with_activation};
+
+/// No activation.
+#[derive(Clone, Copy, Debug)]
+pub(in crate::ops) struct Identity;
+
+impl Function for Identity {
+    const FROM_RESULT: bool = true;
+    #[inline(always)]
+    fn f<T: Float>(self, x: T) -> T {
+        x
+    }
+    #[inline(always)]
+    fn df<T: Float>(self, _: T) -> T {
+        T::ONE
+    }
+    /// None: it is no op, and is checked where it is fused.
+    fn cases() -> Vec<Case<Unary<Self>>> {
+        Vec::new()
+    }
 }
 
 impl Activation {
-    /// All of them.
-    pub(in crate::ops) const ALL: [Activation; 4] =
-        [Activation::None, Activation::Relu, Activation::Hardswish, Activation::Elu];
-
-    /// A name for kernel paths.
-    pub(in crate::ops) fn name(self) -> &'static str {
-        match self {
-            Activation::None => "plain",
-            Activation::Relu => "relu",
-            Activation::Hardswish => "hardswish",
-            Activation::Elu => "elu",
-        }
+    /// A kernel path's name, of those that [`paths!`](paths) makes.
+    pub(in crate::ops) fn among(self, names: [&'static str; COUNT]) -> &'static str {
+        names[self as usize]
     }
 
-    /// A kernel path's name, of those that [`paths`] makes.
-    pub(in crate::ops) fn among(self, [plain, relu, hardswish, elu]: [&'static str; 4]) -> &'static str {
-        match self {
-            Activation::None => plain,
-            Activation::Relu => relu,
-            Activation::Hardswish => hardswish,
-            Activation::Elu => elu,
-        }
+    /// The result of an op that ends in this activation, and what [`backward`](Self::backward) needs of it.
+    ///
+    /// `op` computes the result and finishes it as it is told. Where the derivative needs the argument, that is what it
+    /// computes, and the activation gets a pass of its own.
+    pub(in crate::ops) fn after<T: Float>(
+        self,
+        bias: Option<&[T]>,
+        wanted: bool,
+        op: impl FnOnce(&Finish<T>) -> Tensor<T>,
+    ) -> (Tensor<T>, Option<Tensor<T>>) {
+        let keeps_argument = wanted && !self.follows_from_result();
+        let y = op(&Finish::new(bias, if keeps_argument { Activation::None } else { self }));
+        let kept = (wanted && self != Activation::None).then(|| y.clone());
+        (if keeps_argument { self.of(&y) } else { y }, kept)
     }
 
-    /// Whether the derivative follows from the result alone, so that the argument need not be kept.
-    pub(in crate::ops) fn follows_from_result(self) -> bool {
-        self != Activation::Hardswish
-    }
-
-    /// y from z, in a pass of its own: for who must keep z.
-    pub(in crate::ops) fn of<T: Float>(self, z: &Tensor<T>) -> Tensor<T> {
+    /// y from z, in a pass of its own.
+    fn of<T: Float>(self, z: &Tensor<T>) -> Tensor<T> {
         let finish = Finish::new(None, self);
         Tensor::build(*z.shape(), |out| {
             let work = 4 * out.len();
@@ -64,29 +127,17 @@ impl Activation {
 
     /// dL/dz = dL/dy act'(z), from what was kept: y if the derivative follows from it, else z.
     pub(in crate::ops) fn backward<T: Float>(self, kept: Option<&Tensor<T>>, mut dy: Tensor<T>) -> Tensor<T> {
-        let Some(kept) = kept else { return dy };
-        match self {
-            Activation::None => {}
-            Activation::Relu => scale_by_derivative(Relu, kept, &mut dy),
-            Activation::Hardswish => scale_by_derivative(Hardswish, kept, &mut dy),
-            Activation::Elu => scale_by_derivative(Elu, kept, &mut dy),
+        if let Some(kept) = kept {
+            with_activation!(self, |f| scale_by_derivative(f, kept, &mut dy));
         }
         dy
     }
 }
 
-/// A kernel path's names, by the activation behind it: for [`Activation::among`].
-macro_rules! paths {
-    ($path:literal) => {
-        [$path, concat!($path, "_relu"), concat!($path, "_hardswish"), concat!($path, "_elu")]
-    };
-}
-pub(in crate::ops) use paths;
-
 /// Elements handed to a thread at a time.
 const CHUNK: usize = 1 << 14;
 
-/// `dy *= f'`. ReLU's derivative is the same function of its result as of its argument.
+/// `dy *= f'`.
 fn scale_by_derivative<T: Float>(f: impl Function, kept: &Tensor<T>, dy: &mut Tensor<T>) {
     let dy = dy.data_mut();
     let work = 4 * dy.len();
@@ -119,42 +170,23 @@ impl<T: Float> Finish<T> {
 
     /// Finishes whole rows.
     pub(in crate::ops) fn run(&self, y: &mut [T]) {
-        match self.activation {
-            Activation::None => self.run_with(y, |x| x),
-            Activation::Relu => self.run_with(
-                y,
-                #[inline(always)]
-                |x| Relu.f(x),
-            ),
-            Activation::Hardswish => self.run_with(
-                y,
-                #[inline(always)]
-                |x| Hardswish.f(x),
-            ),
-            Activation::Elu => self.run_with(
-                y,
-                #[inline(always)]
-                |x| Elu.f(x),
-            ),
+        if self.bias.is_some() || self.activation != Activation::None {
+            with_activation!(self.activation, |f| self.run_with(y, f));
         }
     }
 
-    fn run_with(&self, y: &mut [T], f: impl Fn(T) -> T) {
-        match &self.bias {
-            None if self.activation == Activation::None => {}
-            None => simd::dispatch(
-                #[inline(always)]
-                || y.iter_mut().for_each(|y| *y = f(*y)),
-            ),
-            Some(bias) => simd::dispatch(
-                #[inline(always)]
-                || {
+    fn run_with(&self, y: &mut [T], f: impl Function) {
+        simd::dispatch(
+            #[inline(always)]
+            || match &self.bias {
+                None => y.iter_mut().for_each(|y| *y = f.f(*y)),
+                Some(bias) => {
                     for y in y.chunks_mut(bias.len()) {
-                        y.iter_mut().zip(bias.iter()).for_each(|(y, &b)| *y = f(*y + b));
+                        y.iter_mut().zip(bias.iter()).for_each(|(y, &b)| *y = f.f(*y + b));
                     }
-                },
-            ),
-        }
+                }
+            },
+        );
     }
 }
 

@@ -4,6 +4,7 @@
 //! exact up to 2^24. Nobody differentiates them.
 
 use crate::ops::ShapeError;
+use crate::ops::support::put::begin_sum;
 use crate::tensor::shape::MAX_RANK;
 use crate::tensor::{Accum, Float, Shape, Tensor};
 
@@ -70,9 +71,7 @@ pub(in crate::ops) fn scatter<T: Float>(
     index: &Tensor<T>,
     g: &Tensor<T>,
 ) {
-    if accum == Accum::Replace {
-        out.fill(T::ZERO);
-    }
+    begin_sum(out, accum);
     for (at, &g) in pointed(index, into, axis).zip(g.data()) {
         out[at] += g;
     }

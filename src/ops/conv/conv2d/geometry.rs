@@ -15,6 +15,19 @@ pub enum Beyond {
     Nearest,
 }
 
+/// How a convolution is computed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Path {
+    /// One product of matrices: each output sees one pixel.
+    Pointwise,
+    /// Products of patches that were copied: groups, or a dilation along the row.
+    Im2col,
+    /// Products straight from the image's rows.
+    Direct,
+    /// The same, with so many outputs of a row as one pixel.
+    SideBySide(usize),
+}
+
 /// Everything about a convolution but its numbers. Pairs are (height, width).
 #[derive(Clone, Copy, Debug)]
 pub struct Geometry {
@@ -122,6 +135,17 @@ impl Geometry {
         self.batch * self.out[0]
     }
 
+    /// The one place where a path is chosen.
+    pub(in crate::ops) fn path(&self) -> Path {
+        let pointwise = self.kernel == [1; 2] && self.stride == [1; 2] && self.padding == [0; 2] && self.groups == 1;
+        match self.side_by_side() {
+            _ if pointwise => Path::Pointwise,
+            _ if !self.is_direct() => Path::Im2col,
+            1 => Path::Direct,
+            s => Path::SideBySide(s),
+        }
+    }
+
     /// Whether the windows of neighbouring pixels are runs of one padded row, a step apart.
     pub(in crate::ops) fn is_direct(&self) -> bool {
         self.groups == 1 && self.dilation[1] == 1
@@ -148,7 +172,7 @@ impl Geometry {
     /// A product fills vector registers along the output's channels. Where these are few, `s` pixels side by side fill
     /// them better: they share a window that is `s - 1` strides wider, whose weights are zero where a pixel does not
     /// look. That is more arithmetic, but at the full width of the registers.
-    pub(in crate::ops) fn side_by_side(&self) -> usize {
+    fn side_by_side(&self) -> usize {
         if !self.is_direct() || self.kernel[1] == 1 {
             return 1;
         }

@@ -1,10 +1,11 @@
 //! The three products of a convolution, tile by tile: outputs, the gradient of the input, the gradient of the weights.
 
 use super::direct;
-use super::geometry::{Beyond, Geometry};
+use super::geometry::{Beyond, Geometry, Path};
 use super::parts::{Part, in_one_piece, whole};
-use crate::ops::product::linear::sum_into;
 use crate::ops::support::epilogue::Finish;
+use crate::ops::support::put::begin_sum;
+use crate::ops::support::sums::sum_into;
 use crate::tensor::gemm::{Rows, RowsMut, gemm};
 use crate::tensor::pool::Buffer;
 use crate::tensor::simd::copy_run;
@@ -62,10 +63,11 @@ pub(in crate::ops) fn convolve<T: Float>(
     w: &[T],
     finish: &Finish<T>,
 ) {
-    match g.side_by_side() {
-        _ if !g.is_direct() => product(out, accum, g, in_one_piece(g, x, &mut None), w, finish),
-        1 => direct::convolve(out, accum, g, x, w, finish),
-        s => direct::convolve(out, accum, &g.widened(s), x, &widened(g, s, w), finish),
+    match g.path() {
+        Path::Im2col => product(out, accum, g, in_one_piece(g, x, &mut None), w, finish),
+        // As part of another convolution; by itself it is a product of matrices.
+        Path::Pointwise | Path::Direct => direct::convolve(out, accum, g, x, w, finish),
+        Path::SideBySide(s) => direct::convolve(out, accum, &g.widened(s), x, &widened(g, s, w), finish),
     }
 }
 
@@ -215,9 +217,7 @@ fn scatter<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, dy: &[T], w: &[T
     let (c, cg, n, ng, patch, width) = (g.channels, g.group_in(), g.out_channels, g.group_out(), g.patch(), g.out[1]);
     let work = 2 * g.rows() * width * patch * n;
     parallel::for_each_chunk(out, g.size[0] * g.size[1] * c, work, |b, out| {
-        if accum == Accum::Replace {
-            out.fill(T::ZERO);
-        }
+        begin_sum(out, accum);
         let tile = g.tile().min(g.out[0]).max(1);
         let mut patches = Buffer::stale(tile * width * patch);
         for first in (0..g.out[0]).step_by(tile) {

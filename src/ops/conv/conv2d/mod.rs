@@ -10,12 +10,13 @@ pub(in crate::ops) mod geometry;
 pub(in crate::ops) mod kernel;
 pub(in crate::ops) mod parts;
 
-use crate::ops::product::linear;
-use crate::ops::support::epilogue::{Activation, Finish, paths};
+use crate::ops::support::epilogue::{Activation, paths};
+use crate::ops::support::row_products::{self, rows_of};
+use crate::ops::support::sums::bias_gradient;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::gemm::Rows;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
-use geometry::Geometry;
+use geometry::{Geometry, Path};
 use parts::Part;
 
 /// `x [batch, height, width, in]`, `w [kh, kw, in / groups, out]`, optionally `b [out]`
@@ -105,10 +106,6 @@ impl Conv2d {
     fn geometry(&self, inputs: &[Shape]) -> Result<Geometry, ShapeError> {
         Geometry::new(self, &self.image(inputs)?, &inputs[self.parts])
     }
-
-    fn is_pointwise(&self, kernel: [usize; 2]) -> bool {
-        kernel == [1, 1] && self.stride == [1; 2] && self.padding == [0; 2] && self.groups == 1
-    }
 }
 
 impl<T: Float> Op<T> for Conv2d {
@@ -124,21 +121,21 @@ impl<T: Float> Op<T> for Conv2d {
 
     fn algo(&self, inputs: &[Shape]) -> &'static str {
         let Ok(g) = self.geometry(inputs) else { return "none" };
-        let names = match g.side_by_side() {
-            _ if self.parts > 1 && self.is_pointwise(g.kernel) => paths!("parts_pointwise"),
-            _ if self.parts > 1 && !g.is_direct() => paths!("parts_im2col"),
-            1 if self.parts > 1 => paths!("parts_direct"),
-            _ if self.parts > 1 => paths!("parts_side_by_side"),
-            _ if self.is_pointwise(g.kernel) => paths!("pointwise"),
-            _ if !g.is_direct() => paths!("im2col"),
-            1 if self.reflect => paths!("direct_reflect"),
-            1 if self.stride != [1; 2] => paths!("direct_strided"),
-            1 => paths!("direct"),
-            _ if self.reflect => paths!("side_by_side_reflect"),
-            _ if self.stride != [1; 2] => paths!("side_by_side_strided"),
-            _ => paths!("side_by_side"),
-        };
-        self.activation.among(names)
+        let (several, strided) = (self.parts > 1, self.stride != [1; 2]);
+        self.activation.among(match g.path() {
+            Path::Pointwise if several => paths!("parts_pointwise"),
+            Path::Im2col if several => paths!("parts_im2col"),
+            Path::Direct if several => paths!("parts_direct"),
+            Path::SideBySide(_) if several => paths!("parts_side_by_side"),
+            Path::Pointwise => paths!("pointwise"),
+            Path::Im2col => paths!("im2col"),
+            Path::Direct if self.reflect => paths!("direct_reflect"),
+            Path::Direct if strided => paths!("direct_strided"),
+            Path::Direct => paths!("direct"),
+            Path::SideBySide(_) if self.reflect => paths!("side_by_side_reflect"),
+            Path::SideBySide(_) if strided => paths!("side_by_side_strided"),
+            Path::SideBySide(_) => paths!("side_by_side"),
+        })
     }
 
     fn flops(&self, inputs: &[Shape]) -> u64 {
@@ -153,19 +150,15 @@ impl<T: Float> Op<T> for Conv2d {
         let (w, b) = (rest[0], rest.get(1).map(|b| b.data()));
         let shapes: Vec<Shape> = inputs.iter().map(|x| *x.shape()).collect();
         let g = self.geometry(&shapes).expect("checked by the shape rule");
-        // What the backward pass cannot do without is kept in a pass of its own.
-        let keeps_argument = needs.any() && !self.activation.follows_from_result();
-        let finish = Finish::new(b, if keeps_argument { Activation::None } else { self.activation });
-        let y = Tensor::build([g.batch, g.out[0], g.out[1], g.out_channels], |out| {
-            if self.is_pointwise(g.kernel) {
-                let rows: Vec<Rows<T>> = xs.iter().map(|x| rows_of(x)).collect();
-                linear::forward(out, &rows, w.data(), &finish, 0);
-            } else {
-                kernel::convolve(out, Accum::Replace, &g, &parts_of(xs.iter().copied()), w.data(), &finish);
-            }
+        let (y, kept) = self.activation.after(b, needs.any(), |finish| {
+            Tensor::build([g.batch, g.out[0], g.out[1], g.out_channels], |out| match g.path() {
+                Path::Pointwise => {
+                    let rows: Vec<Rows<T>> = xs.iter().map(|x| rows_of(x)).collect();
+                    row_products::forward(out, &rows, w.data(), finish, 0);
+                }
+                _ => kernel::convolve(out, Accum::Replace, &g, &parts_of(xs.iter().copied()), w.data(), finish),
+            })
         });
-        let kept = (needs.any() && self.activation != Activation::None).then(|| y.clone());
-        let y = if keeps_argument { self.activation.of(&y) } else { y };
         let inputs = needs.get(self.parts).then(|| xs.iter().copied().cloned().collect());
         let weights = (0..self.parts).any(|i| needs.get(i)).then(|| w.clone());
         let channels = xs.iter().map(|x| x.shape().last()).collect();
@@ -194,9 +187,9 @@ impl<T: Float> Op<T> for Conv2d {
                         some = kernel::weights_of(&part, first, g.channels, w.data());
                         &some
                     };
-                    match self.is_pointwise(g.kernel) {
-                        true => linear::input_gradient(out, accum, rows_of(&dy), w, 0),
-                        false => kernel::input_gradient(out, accum, &part, dy.data(), w),
+                    match g.path() {
+                        Path::Pointwise => row_products::input_gradient(out, accum, rows_of(&dy), w, 0),
+                        _ => kernel::input_gradient(out, accum, &part, dy.data(), w),
                     }
                 });
                 first += count;
@@ -204,18 +197,18 @@ impl<T: Float> Op<T> for Conv2d {
         }
         if let Some(xs) = inputs {
             sink.accumulate(self.parts, |out, accum| {
-                if !self.is_pointwise(g.kernel) {
+                if g.path() != Path::Pointwise {
                     return kernel::weight_gradient(out, accum, &g, &parts_of(&xs), dy.data());
                 }
                 let mut rest = out;
                 for x in &xs {
                     let (out, others) = std::mem::take(&mut rest).split_at_mut(x.shape().last() * g.out_channels);
                     rest = others;
-                    linear::weight_gradient(out, accum, rows_of(x), rows_of(&dy));
+                    row_products::weight_gradient(out, accum, rows_of(x), rows_of(&dy));
                 }
             });
         }
-        sink.accumulate(self.parts + 1, |out, accum| linear::bias_gradient(out, accum, dy.data()));
+        sink.accumulate(self.parts + 1, |out, accum| bias_gradient(out, accum, rows_of(&dy)));
     }
 }
 
@@ -230,11 +223,6 @@ pub struct Saved<T: Float> {
     geometry: Geometry,
     /// What the activation keeps.
     kept: Option<Tensor<T>>,
-}
-
-/// Pixels as rows of channels.
-pub(in crate::ops) fn rows_of<T: Float>(x: &Tensor<T>) -> Rows<'_, T> {
-    Rows::dense(x.data(), x.shape().rows(), x.shape().last())
 }
 
 pub(in crate::ops) fn parts_of<'a, T: Float>(xs: impl IntoIterator<Item = &'a Tensor<T>>) -> Vec<Part<'a, T>> {

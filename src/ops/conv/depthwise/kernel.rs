@@ -8,11 +8,34 @@ use std::ops::Range;
 
 use pulp::{Simd, WithSimd};
 
-use crate::ops::product::linear::sum_into;
+use crate::ops::support::sums::sum_into;
 use crate::tensor::gemm::{Rows, RowsMut};
 use crate::tensor::pool::Buffer;
 use crate::tensor::simd::dispatch_vector;
 use crate::tensor::{Accum, Float, Tensor, parallel};
+
+/// Windows whose size is known to the compiler, and any other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Path {
+    ThreeByThree,
+    ThreeByThreeStrided,
+    FiveByFive,
+    SevenBySeven,
+    Any,
+}
+
+impl Path {
+    /// The one place where it is chosen.
+    pub fn of(kernel: [usize; 2], stride: usize) -> Self {
+        match (kernel, stride) {
+            ([3, 3], 1) => Path::ThreeByThree,
+            ([3, 3], 2) => Path::ThreeByThreeStrided,
+            ([5, 5], 1) => Path::FiveByFive,
+            ([7, 7], 1) => Path::SevenBySeven,
+            _ => Path::Any,
+        }
+    }
+}
 
 /// The images and the window that is moved over them. Pixels outside the image are 0.
 #[derive(Clone, Copy, Debug)]
@@ -36,6 +59,10 @@ impl Window {
     pub fn output(&self) -> Option<[usize; 2]> {
         let extent = |n: usize, k: usize| Some((n + 2 * self.padding).checked_sub(k)?.checked_div(self.stride)? + 1);
         Some([extent(self.height, self.kernel[0])?, extent(self.width, self.kernel[1])?])
+    }
+
+    fn path(&self) -> Path {
+        Path::of(self.kernel, self.stride)
     }
 
     fn out(&self) -> [usize; 2] {
@@ -222,12 +249,12 @@ impl<T: Float> Line<'_, T> {
     /// One block of channels of the row.
     #[inline(always)]
     fn block<S: Simd, const PART: bool>(&self, simd: S, block: Block<PART>, out: &mut [T]) {
-        match (self.pass.window.kernel, self.pass.window.stride) {
-            ([3, 3], 1) => self.tiles::<S, PART, 3, 1>(simd, block, out),
-            ([3, 3], 2) => self.tiles::<S, PART, 3, 2>(simd, block, out),
-            ([5, 5], 1) => self.tiles::<S, PART, 5, 1>(simd, block, out),
-            ([7, 7], 1) => self.tiles::<S, PART, 7, 1>(simd, block, out),
-            _ => self.singles(simd, block, out, 0, self.pass.width),
+        match self.pass.window.path() {
+            Path::ThreeByThree => self.tiles::<S, PART, 3, 1>(simd, block, out),
+            Path::ThreeByThreeStrided => self.tiles::<S, PART, 3, 2>(simd, block, out),
+            Path::FiveByFive => self.tiles::<S, PART, 5, 1>(simd, block, out),
+            Path::SevenBySeven => self.tiles::<S, PART, 7, 1>(simd, block, out),
+            Path::Any => self.singles(simd, block, out, 0, self.pass.width),
         }
     }
 
@@ -381,7 +408,7 @@ impl<T: Float> GatherLine<'_, T> {
     fn block<S: Simd, const PART: bool>(&self, simd: S, block: Block<PART>, out: &mut [T]) {
         let (window, width) = (self.pass.window, self.pass.window.width);
         let (mut from, mut to) = (0, 0);
-        if (window.kernel, window.stride) == ([3, 3], 2) {
+        if window.path() == Path::ThreeByThreeStrided {
             // Columns 2m and 2m + 1, counted with the padding, of those m where outputs m and m - 1 both exist.
             let first = window.padding.div_ceil(2).max(1);
             let last = ((width + window.padding) / 2).min(self.pass.width).max(first);
@@ -519,21 +546,25 @@ impl<T: Float> Weigh<'_, T> {
     /// One block of channels of one row.
     #[inline(always)]
     fn row<S: Simd, const PART: bool>(&mut self, simd: S, block: Block<PART>, at: usize) {
-        let Window { stride, kernel: [kh, kw], height, width, padding, .. } = self.pass.window;
+        let Window { stride, kernel: [kh, _], height, width, padding, .. } = self.pass.window;
         let (image, row) = (at / self.pass.height, at % self.pass.height);
         let (ky_from, ky_to) = self.pass.window.taps(row, height, kh);
         let line = |ky: usize| (image * height + row * stride + ky - padding) * width;
         // All nine taps at once where they meet the image: three sums alone would wait for one another.
-        let rows = if ([kh, kw], ky_from, ky_to) == ([3, 3], 0, 3) && stride <= 2 { 3 } else { 1 };
+        let path = self.pass.window.path();
+        let square = matches!(path, Path::ThreeByThree | Path::ThreeByThreeStrided);
+        let rows = if square && (ky_from, ky_to) == (0, 3) { 3 } else { 1 };
         for ky in (ky_from..ky_to).step_by(rows) {
-            let tiled = match (rows, kw, stride) {
-                (3, _, 1) => self.taps::<S, PART, 3, 3, 1>(simd, block, at, ky, [line(0), line(1), line(2)]),
-                (3, _, _) => self.taps::<S, PART, 3, 3, 2>(simd, block, at, ky, [line(0), line(1), line(2)]),
-                (_, 3, 1) => self.taps::<S, PART, 1, 3, 1>(simd, block, at, ky, [line(ky)]),
-                (_, 3, 2) => self.taps::<S, PART, 1, 3, 2>(simd, block, at, ky, [line(ky)]),
-                (_, 5, 1) => self.taps::<S, PART, 1, 5, 1>(simd, block, at, ky, [line(ky)]),
-                (_, 7, 1) => self.taps::<S, PART, 1, 7, 1>(simd, block, at, ky, [line(ky)]),
-                _ => 0..0,
+            let tiled = match (path, rows) {
+                (Path::ThreeByThree, 3) => self.taps::<S, PART, 3, 3, 1>(simd, block, at, ky, [0, 1, 2].map(line)),
+                (Path::ThreeByThreeStrided, 3) => {
+                    self.taps::<S, PART, 3, 3, 2>(simd, block, at, ky, [0, 1, 2].map(line))
+                }
+                (Path::ThreeByThree, _) => self.taps::<S, PART, 1, 3, 1>(simd, block, at, ky, [line(ky)]),
+                (Path::ThreeByThreeStrided, _) => self.taps::<S, PART, 1, 3, 2>(simd, block, at, ky, [line(ky)]),
+                (Path::FiveByFive, _) => self.taps::<S, PART, 1, 5, 1>(simd, block, at, ky, [line(ky)]),
+                (Path::SevenBySeven, _) => self.taps::<S, PART, 1, 7, 1>(simd, block, at, ky, [line(ky)]),
+                (Path::Any, _) => 0..0,
             };
             // What the tiles leave: the borders, or everything.
             for ky in ky..ky + rows {
@@ -604,24 +635,4 @@ impl<T: Float> Weigh<'_, T> {
             }
         }
     }
-}
-
-/// The sum of the rows of g, in blocks: the same bits for any number of threads.
-pub(crate) fn bias_gradient<T: Float>(g: Rows<T>, db: &mut [T], accum: Accum) {
-    const BLOCK: usize = 256;
-    let (c, step) = (g.cols, g.row_stride);
-    assert_eq!(db.len(), c, "depthwise: a bias for each channel");
-    if c == 0 {
-        return;
-    }
-    let sums = parallel::map(g.rows.div_ceil(BLOCK), g.rows * c, |i| {
-        Tensor::build([c], |sum| {
-            sum.fill(T::ZERO);
-            let rows = BLOCK.min(g.rows - i * BLOCK);
-            for row in g.data[i * BLOCK * step..].chunks(step).take(rows) {
-                sum.iter_mut().zip(&row[..c]).for_each(|(s, &g)| *s += g);
-            }
-        })
-    });
-    sum_into(db, accum, &sums);
 }

@@ -2,8 +2,9 @@
 
 pub(crate) mod kernel;
 
-use self::kernel::Window;
-use crate::ops::support::epilogue::{Activation, Finish};
+use self::kernel::{Path, Window};
+use crate::ops::support::epilogue::{Activation, paths};
+use crate::ops::support::sums::bias_gradient;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::gemm::{Rows, RowsMut};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
@@ -53,19 +54,13 @@ impl<T: Float> Op<T> for DepthwiseConv2d {
     }
 
     fn algo(&self, inputs: &[Shape]) -> &'static str {
-        let [plain, relu, hardswish, elu] = match (&inputs[1].dims()[..2], self.stride) {
-            ([3, 3], 1) => ["3x3", "3x3_relu", "3x3_hardswish", "3x3_elu"],
-            ([3, 3], 2) => ["3x3_by_2", "3x3_by_2_relu", "3x3_by_2_hardswish", "3x3_by_2_elu"],
-            ([5, 5], 1) => ["5x5", "5x5_relu", "5x5_hardswish", "5x5_elu"],
-            ([7, 7], 1) => ["7x7", "7x7_relu", "7x7_hardswish", "7x7_elu"],
-            _ => ["any", "any_relu", "any_hardswish", "any_elu"],
-        };
-        match self.activation {
-            Activation::None => plain,
-            Activation::Relu => relu,
-            Activation::Hardswish => hardswish,
-            Activation::Elu => elu,
-        }
+        self.activation.among(match Path::of([inputs[1].dims()[0], inputs[1].dims()[1]], self.stride) {
+            Path::ThreeByThree => paths!("3x3"),
+            Path::ThreeByThreeStrided => paths!("3x3_by_2"),
+            Path::FiveByFive => paths!("5x5"),
+            Path::SevenBySeven => paths!("7x7"),
+            Path::Any => paths!("any"),
+        })
     }
 
     fn flops(&self, inputs: &[Shape]) -> u64 {
@@ -78,17 +73,14 @@ impl<T: Float> Op<T> for DepthwiseConv2d {
         let (window, c) = (self.window(x.shape(), w.shape()).expect("checked by the shape rule"), x.shape().last());
         let [height, width] = window.output().expect("checked by the shape rule");
         let shape = x.shape().with(1, height).with(2, width);
-        // What the backward pass cannot do without is kept in a pass of its own.
-        let keeps_argument = needs.any() && !self.activation.follows_from_result();
-        let finish = Finish::new(None, if keeps_argument { Activation::None } else { self.activation });
-        let y = Tensor::build(shape, |out| {
-            let x = Rows::dense(x.data(), x.shape().rows(), c);
-            let y = RowsMut::dense(out, shape.rows(), c);
-            let bias = b.map(|b| b.data());
-            kernel::forward(&window, x, w.data(), bias, y, Accum::Replace, self.tile, &|rows| finish.run(rows));
+        let (y, kept) = self.activation.after(None, needs.any(), |finish| {
+            Tensor::build(shape, |out| {
+                let x = Rows::dense(x.data(), x.shape().rows(), c);
+                let y = RowsMut::dense(out, shape.rows(), c);
+                let bias = b.map(|b| b.data());
+                kernel::forward(&window, x, w.data(), bias, y, Accum::Replace, self.tile, &|rows| finish.run(rows));
+            })
         });
-        let kept = (needs.any() && self.activation != Activation::None).then(|| y.clone());
-        let y = if keeps_argument { self.activation.of(&y) } else { y };
         (vec![y], (needs.get(1).then(|| x.clone()), needs.get(0).then(|| w.clone()), [*x.shape(), *w.shape()], kept))
     }
 
@@ -114,7 +106,7 @@ impl<T: Float> Op<T> for DepthwiseConv2d {
                 kernel::weight_gradient(&window, x, g, out, accum, self.tile);
             });
         }
-        sink.accumulate(2, |out, accum| kernel::bias_gradient(g, out, accum));
+        sink.accumulate(2, |out, accum| bias_gradient(out, accum, g));
     }
 }
 

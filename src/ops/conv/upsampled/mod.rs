@@ -9,9 +9,11 @@ mod pointwise;
 mod squares;
 
 use super::conv2d::geometry::{Beyond, Geometry};
-use super::conv2d::{Conv2d, kernel, parts_of, rows_of};
-use crate::ops::product::linear;
+use super::conv2d::{Conv2d, kernel, parts_of};
 use crate::ops::support::epilogue::{Activation, Finish, paths};
+use crate::ops::support::put::put_run;
+use crate::ops::support::row_products::{self, rows_of};
+use crate::ops::support::sums::bias_gradient;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::gemm::Rows;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
@@ -30,6 +32,15 @@ pub struct UpsampledConv2d {
     pub activation: Activation,
 }
 
+/// How the small image is read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Path {
+    /// A 1x1 window: one product for the four pixels of a square.
+    Pointwise,
+    /// A 3x3 window: four windows of 2x2, one for each pixel of a square.
+    Squares,
+}
+
 /// The two convolutions that are added.
 #[derive(Clone, Copy, Debug)]
 struct Both {
@@ -46,8 +57,9 @@ impl Both {
         self.small.channels + self.full.channels
     }
 
-    fn is_pointwise(&self) -> bool {
-        self.small.kernel == [1, 1]
+    /// The one place where a path is chosen.
+    fn path(&self) -> Path {
+        if self.small.kernel == [1, 1] { Path::Pointwise } else { Path::Squares }
     }
 }
 
@@ -106,12 +118,18 @@ impl<T: Float> Op<T> for UpsampledConv2d {
 
     fn algo(&self, inputs: &[Shape]) -> &'static str {
         let Ok(g) = self.geometry(inputs) else { return "none" };
-        self.activation.among(if g.is_pointwise() { paths!("pointwise") } else { paths!("squares") })
+        self.activation.among(match g.path() {
+            Path::Pointwise => paths!("pointwise"),
+            Path::Squares => paths!("squares"),
+        })
     }
 
     fn flops(&self, inputs: &[Shape]) -> u64 {
         let Ok(g) = self.geometry(inputs) else { return 0 };
-        let taps = if g.is_pointwise() { 1 } else { squares::PHASES.len() * squares::TAPS };
+        let taps = match g.path() {
+            Path::Pointwise => 1,
+            Path::Squares => squares::PHASES.len() * squares::TAPS,
+        };
         let of_small = g.small.rows() * g.small.out[1] * taps * g.small.channels;
         2 * ((of_small + g.full.rows() * g.full.out[1] * g.full.patch()) * g.full.out_channels) as u64
     }
@@ -121,33 +139,30 @@ impl<T: Float> Op<T> for UpsampledConv2d {
         let (w, b) = (rest[0], rest.get(1).map(|b| b.data()));
         let shapes: Vec<Shape> = inputs.iter().map(|x| *x.shape()).collect();
         let g = self.geometry(&shapes).expect("checked by the shape rule");
-        // What the backward pass cannot do without is kept in a pass of its own.
-        let keeps_argument = needs.any() && !self.activation.follows_from_result();
-        let finish = Finish::new(b, if keeps_argument { Activation::None } else { self.activation });
         let of_small = kernel::weights_of(&g.small, 0, g.channels(), w.data());
-        let y = Tensor::build([g.full.batch, g.full.out[0], g.full.out[1], g.full.out_channels], |out| {
-            let mut accum = Accum::Replace;
-            if g.full.channels > 0 {
-                let of_full = kernel::weights_of(&g.full, g.small.channels, g.channels(), w.data());
-                match g.is_pointwise() {
-                    true => {
-                        let rows: Vec<Rows<T>> = xs[1..].iter().map(|x| rows_of(x)).collect();
-                        linear::forward(out, &rows, &of_full, &Finish::nothing(), 0);
+        let (y, kept) = self.activation.after(b, needs.any(), |finish| {
+            Tensor::build([g.full.batch, g.full.out[0], g.full.out[1], g.full.out_channels], |out| {
+                let mut accum = Accum::Replace;
+                if g.full.channels > 0 {
+                    let of_full = kernel::weights_of(&g.full, g.small.channels, g.channels(), w.data());
+                    match g.path() {
+                        Path::Pointwise => {
+                            let rows: Vec<Rows<T>> = xs[1..].iter().map(|x| rows_of(x)).collect();
+                            row_products::forward(out, &rows, &of_full, &Finish::nothing(), 0);
+                        }
+                        Path::Squares => {
+                            let parts = parts_of(xs[1..].iter().copied());
+                            kernel::convolve(out, accum, &g.full, &parts, &of_full, &Finish::nothing());
+                        }
                     }
-                    false => {
-                        let parts = parts_of(xs[1..].iter().copied());
-                        kernel::convolve(out, accum, &g.full, &parts, &of_full, &Finish::nothing());
-                    }
+                    accum = Accum::Add;
                 }
-                accum = Accum::Add;
-            }
-            match g.is_pointwise() {
-                true => pointwise::convolve(out, accum, &g.small, rows_of(xs[0]), &of_small, &finish),
-                false => squares::convolve(out, accum, &g.small, xs[0].data(), &of_small, &finish),
-            }
+                match g.path() {
+                    Path::Pointwise => pointwise::convolve(out, accum, &g.small, rows_of(xs[0]), &of_small, finish),
+                    Path::Squares => squares::convolve(out, accum, &g.small, xs[0].data(), &of_small, finish),
+                }
+            })
         });
-        let kept = (needs.any() && self.activation != Activation::None).then(|| y.clone());
-        let y = if keeps_argument { self.activation.of(&y) } else { y };
         let inputs = needs.get(self.parts + 1).then(|| xs.iter().copied().cloned().collect());
         let weights = (0..=self.parts).any(|i| needs.get(i)).then(|| w.clone());
         let channels = xs[1..].iter().map(|x| x.shape().last()).collect();
@@ -161,12 +176,12 @@ impl<T: Float> Op<T> for UpsampledConv2d {
         let dy = self.activation.backward(kept.as_ref(), upstream.only());
         drop(kept);
         // For a 1x1 window the four pixels of a square count as one.
-        let sums = g.is_pointwise().then(|| pointwise::sum_squares(&g.small, &dy));
+        let sums = (g.path() == Path::Pointwise).then(|| pointwise::sum_squares(&g.small, &dy));
         if let Some(w) = weights {
             sink.accumulate(0, |out, accum| {
                 let w = kernel::weights_of(&g.small, 0, g.channels(), w.data());
                 match &sums {
-                    Some(sums) => linear::input_gradient(out, accum, rows_of(sums), &w, 0),
+                    Some(sums) => row_products::input_gradient(out, accum, rows_of(sums), &w, 0),
                     None => squares::input_gradient(out, accum, &g.small, dy.data(), &w),
                 }
             });
@@ -175,9 +190,9 @@ impl<T: Float> Op<T> for UpsampledConv2d {
                 let part = Geometry { channels: count, ..g.full };
                 sink.accumulate(i + 1, |out, accum| {
                     let w = kernel::weights_of(&part, first, g.channels(), w.data());
-                    match g.is_pointwise() {
-                        true => linear::input_gradient(out, accum, rows_of(&dy), &w, 0),
-                        false => kernel::input_gradient(out, accum, &part, dy.data(), &w),
+                    match g.path() {
+                        Path::Pointwise => row_products::input_gradient(out, accum, rows_of(&dy), &w, 0),
+                        Path::Squares => kernel::input_gradient(out, accum, &part, dy.data(), &w),
                     }
                 });
                 first += count;
@@ -188,16 +203,16 @@ impl<T: Float> Op<T> for UpsampledConv2d {
                 let n = g.full.out_channels;
                 let (small, others) = xs.split_at(1);
                 let of_small = Tensor::build([g.small.patch() * n], |out| match &sums {
-                    Some(sums) => linear::weight_gradient(out, Accum::Replace, rows_of(&small[0]), rows_of(sums)),
+                    Some(sums) => row_products::weight_gradient(out, Accum::Replace, rows_of(&small[0]), rows_of(sums)),
                     None => squares::weight_gradient(out, &g.small, small[0].data(), dy.data()),
                 });
                 put_weights(out, accum, g.channels() * n, 0, of_small.data(), g.small.channels * n);
                 let mut first = g.small.channels;
-                if g.is_pointwise() {
+                if g.path() == Path::Pointwise {
                     for x in others {
                         let count = x.shape().last();
                         let out = &mut out[first * n..(first + count) * n];
-                        linear::weight_gradient(out, accum, rows_of(x), rows_of(&dy));
+                        row_products::weight_gradient(out, accum, rows_of(x), rows_of(&dy));
                         first += count;
                     }
                 } else if g.full.channels > 0 {
@@ -208,7 +223,7 @@ impl<T: Float> Op<T> for UpsampledConv2d {
                 }
             });
         }
-        sink.accumulate(self.parts + 2, |out, accum| linear::bias_gradient(out, accum, dy.data()));
+        sink.accumulate(self.parts + 2, |out, accum| bias_gradient(out, accum, rows_of(&dy)));
     }
 }
 
@@ -219,10 +234,7 @@ fn put_weights<T: Float>(out: &mut [T], accum: Accum, block: usize, first: usize
     }
     for (out, w) in out.chunks_exact_mut(block).zip(w.chunks_exact(count)) {
         let out = &mut out[first..first + count];
-        match accum {
-            Accum::Replace => out.copy_from_slice(w),
-            Accum::Add => out.iter_mut().zip(w).for_each(|(o, &w)| *o += w),
-        }
+        put_run(accum, out, w);
     }
 }
 

@@ -1,16 +1,16 @@
 //! The 1x1 window: a product of the small image's pixels, whose results fill squares of four.
 
 use crate::ops::conv::conv2d::geometry::Geometry;
-use crate::ops::image::upsample_nearest;
-use crate::ops::product::linear;
 use crate::ops::support::epilogue::Finish;
+use crate::ops::support::put::put_run;
+use crate::ops::support::{row_products, squares};
 use crate::tensor::gemm::Rows;
 use crate::tensor::{Accum, Float, Tensor, parallel, simd};
 
 /// `out = x w` in squares, or added to what is there; and finished.
 pub(super) fn convolve<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: Rows<T>, w: &[T], finish: &Finish<T>) {
     let n = g.out_channels;
-    let products = Tensor::build([x.rows, n], |out| linear::forward(out, &[x], w, &Finish::nothing(), 0));
+    let products = Tensor::build([x.rows, n], |out| row_products::forward(out, &[x], w, &Finish::nothing(), 0));
     let line = g.out[1] * n;
     let work = 2 * out.len();
     if work == 0 {
@@ -24,10 +24,7 @@ pub(super) fn convolve<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: R
                 for out in out.chunks_exact_mut(2 * line) {
                     for (pair, product) in out.chunks_exact_mut(2 * n).zip(products.chunks_exact(n)) {
                         for out in pair.chunks_exact_mut(n) {
-                            match accum {
-                                Accum::Replace => out.copy_from_slice(product),
-                                Accum::Add => out.iter_mut().zip(product).for_each(|(o, &p)| *o += p),
-                            }
+                            put_run(accum, out, product);
                         }
                     }
                 }
@@ -41,6 +38,6 @@ pub(super) fn convolve<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: R
 pub(super) fn sum_squares<T: Float>(g: &Geometry, dy: &Tensor<T>) -> Tensor<T> {
     let n = g.out_channels;
     Tensor::build([g.batch, g.out[0], g.out[1], n], |out| {
-        upsample_nearest::sum_squares(out, Accum::Replace, dy.data(), [g.out[1], n], 2);
+        squares::sum_squares(out, Accum::Replace, dy.data(), [g.out[1], n], 2);
     })
 }
