@@ -6,6 +6,7 @@ pub mod inputs;
 pub mod kitti;
 pub mod pyramid;
 pub mod resize;
+mod street;
 
 use std::sync::Arc;
 

@@ -4,7 +4,8 @@ use super::draw::Draw;
 use super::light::GROUND;
 use super::props;
 use super::shape::Shape;
-use super::surface::{Colour, Facade, Material};
+use super::surface::{Facade, Material};
+use super::texture::Colour;
 use super::world::{Style, World, across as beside, vary};
 
 const GROUND_Y: f64 = GROUND as f64;

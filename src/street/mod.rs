@@ -1,13 +1,13 @@
 //! The embedded street: a driving world made from a seed, at any size, with exact depth, poses and intrinsics.
 //!
 //! It stands in for a recorded dataset where there is none: a training run starts with no download, and every claim
-//! about geometry can be checked, since the truth is known. `world` says what stands where, `camera` how the car moves,
-//! `shape` where rays meet solids, `surface`, `weather` and `light` what they look like there, `render` puts it into pictures,
-//! `dataset` and `export` hand them out. The world's frame has x right, y down, z along the street, in metres; the first
+//! about geometry can be checked, since the truth is known. `build` says what stands where (with `houses` and `props`) and fills a `world`, `camera` how the
+//! car moves, `shape` where rays meet solids, `surface`, `weather` and `light` what they look like there; `render` puts it
+//! into pictures, `rendered` and `export` hand them out. The world's frame has x right, y down, z along the street, in metres; the first
 //! camera is at its origin, and the road at y = 1.65.
 
+mod build;
 mod camera;
-
 mod draw;
 pub mod export;
 mod houses;

@@ -7,14 +7,13 @@ use image::RgbImage;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use super::build::street;
 use super::camera::{Pose, View, drive};
 use super::draw::Draw;
 use super::render::Scene;
 use super::world::World;
 use crate::camera::Intrinsics;
-use crate::data::Dataset;
 use crate::depth::DepthMap;
-use crate::{Error, Result};
 
 /// What to render.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -57,7 +56,7 @@ struct Sequence {
     images: Vec<Arc<RgbImage>>,
 }
 
-/// Rendered streets: a [`Dataset`] with exact depth and poses. A sample is a frame that has both neighbours.
+/// Rendered streets, with exact depth and poses. A sample is a frame that has both neighbours.
 pub struct Street {
     config: StreetConfig,
     sequences: Vec<Sequence>,
@@ -74,7 +73,7 @@ impl Street {
         let total = config.sequences * config.frames;
         let done = AtomicUsize::new(0);
         let sequence = |k: usize| {
-            let world = World::new(&mut Draw::new(config.seed, k as u64, WORLD), config.frames, config.moving_cars);
+            let world = street(&mut Draw::new(config.seed, k as u64, WORLD), config.frames, config.moving_cars);
             let draw = &mut Draw::new(config.seed, k as u64, PATH);
             let poses = drive(draw, config.frames, world.lane, world.room, config.moving_cars);
             let image = |(frame, pose): (usize, &Pose)| {
@@ -112,9 +111,14 @@ impl Street {
         Scene::new(world, View::new(&self.config, poses[frame]), frame).depth()
     }
 
+    /// How many samples there are: frames that have both neighbours.
+    pub fn samples(&self) -> usize {
+        self.sequences.len() * self.config.frames.saturating_sub(2)
+    }
+
     /// The sequence and the frame of a sample. Panics if there is no such sample.
     pub fn locate(&self, sample: usize) -> (usize, usize) {
-        assert!(sample < self.len(), "the street has {} samples, not one numbered {sample}", self.len());
+        assert!(sample < self.samples(), "the street has {} samples, not one numbered {sample}", self.samples());
         let each = self.config.frames - 2;
         (sample / each, sample % each + 1)
     }
@@ -127,36 +131,6 @@ impl Street {
         let source = frame.checked_add_signed(offset as isize).and_then(|f| poses.get(f));
         let source = source.unwrap_or_else(|| panic!("sequence {sequence} has no frame {frame}{offset:+}"));
         poses[frame].relative_to(source)
-    }
-}
-
-impl Dataset for Street {
-    fn len(&self) -> usize {
-        self.sequences.len() * self.config.frames.saturating_sub(2)
-    }
-
-    fn name(&self, sample: usize) -> String {
-        let (sequence, frame) = self.locate(sample);
-        format!("street seed {}, sequence {sequence}, frame {frame}", self.config.seed)
-    }
-
-    fn image(&self, sample: usize, offset: i32) -> Result<Arc<RgbImage>> {
-        let (sequence, frame) = self.locate(sample);
-        let images = &self.sequences[sequence].images;
-        let found = frame.checked_add_signed(offset as isize).and_then(|f| images.get(f));
-        found.cloned().ok_or_else(|| {
-            let message = format!("{}: no frame at {offset:+}; the sequence has {}", self.name(sample), images.len());
-            Error::setting("offset", message)
-        })
-    }
-
-    fn intrinsics(&self, _sample: usize) -> Intrinsics {
-        self.config.intrinsics
-    }
-
-    fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {
-        let (sequence, frame) = self.locate(sample);
-        Ok(Some(self.frame_depth(sequence, frame)))
     }
 }
 

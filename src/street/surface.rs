@@ -2,11 +2,8 @@
 //! 0 to 1, before the light.
 
 use super::light::GROUND;
-use super::texture::{Patch, band, fade, floor, hash, hash_unit, mix, noise3, pulse, pulse_centred, scale};
+use super::texture::{Colour, Patch, band, fade, floor, hash, hash_unit, mix, noise3, pulse, pulse_centred, scale};
 use super::weather::weathered;
-
-/// A colour: red, green, blue.
-pub(crate) type Colour = [f32; 3];
 
 /// A point of a surface, with all that its look depends on.
 pub(crate) struct Point {

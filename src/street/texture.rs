@@ -3,6 +3,9 @@
 //!
 //! A footprint is the width, in the texture's own metres, of what one pixel averages.
 
+/// A colour: red, green, blue.
+pub(crate) type Colour = [f32; 3];
+
 /// The largest whole number not above `x`, for `|x| < 2^31`; without SSE4.1 `f32::floor` would be a call.
 pub(crate) fn floor(x: f32) -> i32 {
     let i = x as i32;

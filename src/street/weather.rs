@@ -4,8 +4,7 @@
 //! loss learns no depth from it. Real surfaces are rarely plain; these patches are their dirt, at sizes from some
 //! metres to a hand's width.
 
-use super::surface::Colour;
-use super::texture::{Patch, mix, scale};
+use super::texture::{Colour, Patch, mix, scale};
 
 const DUST: Colour = [0.52, 0.49, 0.44];
 /// Cells a metre and amplitudes.

@@ -1,0 +1,101 @@
+//! The rules of the house that the compiler does not check: who may import whom, and where `unsafe` stands.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// All Rust files below a folder of the project.
+fn sources(folder: &str) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    let mut open = vec![Path::new(env!("CARGO_MANIFEST_DIR")).join(folder)];
+    while let Some(folder) = open.pop() {
+        for entry in fs::read_dir(&folder).unwrap_or_else(|e| panic!("{}: {e}", folder.display())) {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                open.push(path);
+            } else if path.extension().is_some_and(|ending| ending == "rs") {
+                found.push(path);
+            }
+        }
+    }
+    assert!(found.len() > 3, "{folder} holds Rust files");
+    found
+}
+
+/// The code of a file: without comments, and without the tests at its end.
+fn code(path: &Path) -> String {
+    let text = fs::read_to_string(path).unwrap();
+    let text = text.split("#[cfg(test)]\nmod ").next().unwrap_or_default();
+    text.lines().map(|line| line.split("//").next().unwrap_or_default()).collect::<Vec<_>>().join("\n")
+}
+
+/// The part of a path after `src/`.
+fn place(path: &Path) -> String {
+    path.strip_prefix(Path::new(env!("CARGO_MANIFEST_DIR")).join("src")).unwrap().to_str().unwrap().replace('\\', "/")
+}
+
+/// The words that follow `prefix` in a text.
+fn words_after<'a>(text: &'a str, prefix: &str) -> impl Iterator<Item = &'a str> {
+    text.split(prefix).skip(1).map(|rest| rest.split(|c: char| !c.is_alphanumeric() && c != '_').next().unwrap_or(""))
+}
+
+/// The folders and files of `src/` in the order of ARCHITECTURE.md's table.
+fn order() -> Vec<String> {
+    let table = include_str!("../ARCHITECTURE.md");
+    let rows = table.lines().filter(|line| line.starts_with("| `src/"));
+    let names = rows.flat_map(|line| {
+        let cell = line.split('|').nth(1).unwrap_or_default();
+        words_after(cell, "`src/").map(str::to_owned).collect::<Vec<_>>()
+    });
+    names.collect()
+}
+
+#[test]
+fn a_folder_imports_only_what_stands_above_it() {
+    let order = order();
+    assert!(order.len() > 12 && order[0] == "random", "{order:?}");
+    let rank = |name: &str| order.iter().position(|other| other == name);
+    let mut seen = 0;
+    for path in sources("src") {
+        let place = place(&path);
+        if place.ends_with("/tests.rs") || ["lib.rs", "main.rs", "test_support.rs"].contains(&&place[..]) {
+            continue;
+        }
+        let own = place.split(['/', '.']).next().unwrap_or_default();
+        let own_rank = rank(own).unwrap_or_else(|| panic!("src/{own} is not in ARCHITECTURE.md's table"));
+        for name in words_after(&code(&path), "crate::") {
+            if let Some(other) = rank(name) {
+                seen += 1;
+                assert!(other <= own_rank, "src/{place} imports `{name}`, which stands below it");
+            }
+        }
+    }
+    assert!(seen > 300, "{seen} imports");
+}
+
+/// A helper of two families belongs to `support`.
+#[test]
+fn no_family_of_ops_imports_another() {
+    let families = ["reduce", "movement", "product", "normalise", "conv", "attention", "image", "depth"]
+        .map(|f| format!("ops/{f}/"));
+    for path in sources("src/ops") {
+        let place = place(&path);
+        let Some(own) = families.iter().find(|family| place.starts_with(*family)) else { continue };
+        for name in words_after(&code(&path), "crate::ops::") {
+            let imported = format!("ops/{name}/");
+            assert!(imported == *own || !families.contains(&imported), "src/{place} imports ops::{name}");
+        }
+    }
+}
+
+#[test]
+fn unsafe_stands_in_one_file_once() {
+    let mut found = Vec::new();
+    for path in sources("src") {
+        let text = code(&path);
+        let blocks = text.split(|c: char| !c.is_alphanumeric() && c != '_').filter(|word| *word == "unsafe").count();
+        if blocks > 0 {
+            found.push((place(&path), blocks));
+        }
+    }
+    assert_eq!(found, [("tensor/gemm_small.rs".to_owned(), 1)]);
+}
