@@ -21,7 +21,7 @@ pub fn main() -> parallax::Result<()> {
         depth.width,
         depth.height,
         prediction.inverse_depth.unit,
-        depth.metres[100 * 320 + 160]
+        depth.values[100 * 320 + 160]
     );
     std::fs::remove_dir_all(&folder).map_err(|e| parallax::Error::io(&folder, e))
 }

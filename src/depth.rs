@@ -11,12 +11,23 @@ pub struct Disparity {
     pub values: Vec<f32>,
 }
 
+/// What sigmoid disparity means: inverse depth is `a + b disparity` with `[a, b] = [1/max, 1/min - 1/max]`, so that
+/// disparity 0 is the greatest depth and 1 the least (Monodepth2, section 3.2).
+pub fn inverse_depth_of_disparity(min_depth: f64, max_depth: f64) -> [f64; 2] {
+    [1.0 / max_depth, 1.0 / min_depth - 1.0 / max_depth]
+}
+
+/// Where the centre of pixel `i` of `to` lies among `from` pixels, in pixels from the centre of the first, and at least
+/// 0: `(i + 1/2) from/to - 1/2`, as centres are at halves.
+pub fn half_pixel(i: usize, from: usize, to: usize) -> f64 {
+    ((i as f64 + 0.5) * from as f64 / to as f64 - 0.5).max(0.0)
+}
+
 impl Disparity {
-    /// Inverse depth up to scale: `1/max + (1/min - 1/max) disparity` (Monodepth2, section 3.2), with the depths that
-    /// disparity 1 and 0 stand for.
+    /// Inverse depth up to scale, for the depths that disparity 1 and 0 stand for: see [`inverse_depth_of_disparity`].
     pub fn inverse_depth(&self, min_depth: f64, max_depth: f64) -> InverseDepth {
-        let (near, far) = (1.0 / min_depth as f32, 1.0 / max_depth as f32);
-        let values = self.values.iter().map(|d| far + (near - far) * d).collect();
+        let [a, b] = inverse_depth_of_disparity(min_depth, max_depth).map(|x| x as f32);
+        let values = self.values.iter().map(|d| d.mul_add(b, a)).collect();
         InverseDepth { width: self.width, height: self.height, values, unit: Unit::Relative }
     }
 }
@@ -64,13 +75,39 @@ impl InverseDepth {
         InverseDepth { width, height, values, unit: self.unit }
     }
 
-    /// The map of depths, which are metres if the unit is.
-    pub fn depth(&self) -> DepthMap {
-        DepthMap { width: self.width, height: self.height, metres: self.values.iter().map(|d| 1.0 / d).collect() }
+    /// Its inverses.
+    pub fn depth(&self) -> Depth {
+        let values = self.values.iter().map(|d| 1.0 / d).collect();
+        Depth { width: self.width, height: self.height, values, unit: self.unit }
     }
 }
 
-/// A map of depth (camera z), row-major, 0 where nothing is known: metres, but for predictions without a scale.
+/// Predicted depth (camera z) of every pixel, row-major.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Depth {
+    /// Width in pixels.
+    pub width: usize,
+    /// Height in pixels.
+    pub height: usize,
+    /// `height * width` depths.
+    pub values: Vec<f32>,
+    /// Their unit.
+    pub unit: Unit,
+}
+
+impl Depth {
+    /// The same in metres; nothing if the unit is not known.
+    pub fn metric(self) -> Option<DepthMap> {
+        (self.unit == Unit::Metres).then(|| self.as_if_metres())
+    }
+
+    /// The numbers as though they were metres, for file formats that have no other unit.
+    pub fn as_if_metres(self) -> DepthMap {
+        DepthMap { width: self.width, height: self.height, metres: self.values }
+    }
+}
+
+/// A map of depth (camera z) in metres, row-major, 0 where nothing is known.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DepthMap {
     /// Width in pixels.
@@ -82,7 +119,7 @@ pub struct DepthMap {
 }
 
 /// Bilinear resize of a row-major map from `(h, w)` to `(h, w)`, without antialiasing, in f64. Pixel centres are at
-/// halves (align_corners false): output i reads the input at `(i + 1/2) in/out - 1/2`, cut to the map.
+/// halves ([`half_pixel`]; align_corners false), positions cut to the map.
 ///
 /// # Panics
 /// If `map` does not hold `from.0 * from.1` values or a size is empty.
@@ -90,9 +127,8 @@ pub fn resize_bilinear(map: &[f32], from: (usize, usize), to: (usize, usize)) ->
     assert_eq!(map.len(), from.0 * from.1, "resize_bilinear: a map of {from:?} expected");
     let taps = |input: usize, output: usize| -> Vec<(usize, usize, f64)> {
         assert!(input > 0 && output > 0, "resize_bilinear: {from:?} to {to:?}");
-        let scale = input as f64 / output as f64;
         let tap = |i: usize| {
-            let x = ((i as f64 + 0.5) * scale - 0.5).max(0.0);
+            let x = half_pixel(i, input, output);
             let below = (x as usize).min(input - 1);
             (below, (below + 1).min(input - 1), x - below as f64)
         };
@@ -117,7 +153,7 @@ mod tests {
     #[test]
     fn disparity_spans_the_range_of_depths() {
         let disparity = Disparity { width: 3, height: 1, values: vec![0.0, 0.5, 1.0] };
-        let depth = disparity.inverse_depth(0.1, 100.0).depth().metres;
+        let depth = disparity.inverse_depth(0.1, 100.0).depth().values;
         for (found, expected) in depth.iter().zip([100.0, 1.0 / 5.005, 0.1]) {
             assert!((found / expected - 1.0).abs() < 1e-6, "{depth:?}");
         }
@@ -126,8 +162,11 @@ mod tests {
     #[test]
     fn a_factor_multiplies_depths_and_not_their_inverses() {
         let map = InverseDepth { width: 2, height: 1, values: vec![0.5, 0.25], unit: Unit::Relative };
-        assert_eq!(map.resized(1, 2, 3.0).depth().metres, [6.0, 12.0]);
+        assert_eq!(map.resized(1, 2, 3.0).depth().values, [6.0, 12.0]);
         assert!(map.is_whole());
+        assert_eq!(map.depth().metric(), None);
+        let metric = InverseDepth { unit: Unit::Metres, ..map.clone() };
+        assert_eq!(metric.depth().metric().unwrap().metres, [2.0, 4.0]);
         for broken in [f32::NAN, f32::INFINITY, 0.0, -1.0] {
             assert!(!InverseDepth { values: vec![0.5, broken], ..map.clone() }.is_whole(), "{broken}");
         }

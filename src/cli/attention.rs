@@ -7,8 +7,9 @@ use image::RgbImage;
 use parallax::data::batch::to_tensor;
 use parallax::data::resize::lanczos;
 use parallax::eval::attention::{Attention, AttentionRows, attention, saliency};
-use parallax::formats::atomic::{check_writable, write_bytes_atomically};
+use parallax::formats::atomic::check_writable;
 use parallax::formats::picture::{check_picture, read_picture};
+use parallax::formats::png::write_png;
 use parallax::report::overlay::{Overlay, mark};
 use parallax::tensor::Tensor;
 use parallax::train::run::load_weights;
@@ -217,12 +218,4 @@ fn figure(picture: &RgbImage, at: Point, found: &Attention<f32>, saliency: &Tens
         line
     });
     sheet(picture, position, top, &lines.collect::<Vec<_>>())
-}
-
-fn write_png(path: &Path, picture: &RgbImage) -> Result<()> {
-    let mut bytes = std::io::Cursor::new(Vec::new());
-    picture
-        .write_to(&mut bytes, image::ImageFormat::Png)
-        .map_err(|e| Error::file(path, format!("could not be encoded: {e}")))?;
-    write_bytes_atomically(path, bytes.get_ref())
 }

@@ -1,6 +1,6 @@
 //! `parallax predict`.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Instant;
 
 use image::RgbImage;
@@ -11,11 +11,12 @@ use parallax::depth::InverseDepth;
 use parallax::eval::camera_height::find_ground;
 use parallax::eval::metrics::{STEREO_SCALE, median};
 use parallax::eval::predictor::Predictor;
-use parallax::formats::atomic::{check_writable, write_bytes_atomically};
+use parallax::formats::atomic::check_writable;
 use parallax::formats::depth_png::write_depth_png;
 use parallax::formats::npy::write_npy;
 use parallax::formats::picture::read_picture;
 use parallax::formats::ply::write_point_cloud;
+use parallax::formats::png::write_png;
 use parallax::report::colormap::disparity_to_image;
 use parallax::weights::Weights;
 use parallax::{Error, Result};
@@ -257,7 +258,7 @@ fn write(outputs: &Outputs, picture: &RgbImage, inverse: &InverseDepth, camera: 
     if outputs.depth.is_none() && outputs.points.is_none() {
         return Ok(());
     }
-    let depth = inverse.depth();
+    let depth = inverse.depth().as_if_metres();
     if let Some(path) = &outputs.depth {
         write_depth_png(path, &depth)?;
     }
@@ -265,14 +266,6 @@ fn write(outputs: &Outputs, picture: &RgbImage, inverse: &InverseDepth, camera: 
         write_point_cloud(path, &depth, picture, camera)?;
     }
     Ok(())
-}
-
-fn write_png(path: &Path, picture: &RgbImage) -> Result<()> {
-    let mut bytes = std::io::Cursor::new(Vec::new());
-    picture
-        .write_to(&mut bytes, image::ImageFormat::Png)
-        .map_err(|e| Error::file(path, format!("could not be encoded: {e}")))?;
-    write_bytes_atomically(path, bytes.get_ref())
 }
 
 impl Args {

@@ -33,7 +33,7 @@ pub struct Evaluation {
 ///
 /// let predictor = Predictor::load("runs/1")?;
 /// let prediction = predictor.depth_of(&read_picture("street.jpg".as_ref())?)?;
-/// println!("{:?}: {:?}", prediction.inverse_depth.unit, prediction.inverse_depth.depth().metres[0]);
+/// println!("{:?}: {:?}", prediction.inverse_depth.unit, prediction.inverse_depth.depth().values[0]);
 /// # Ok::<(), parallax::Error>(())
 /// ```
 pub struct Predictor {

@@ -6,7 +6,8 @@
 //! | [`safetensors`] | named tensors, the crate's own checkpoints |
 //! | [`pth`] | named tensors in PyTorch's pickles, read as data |
 //! | [`npz`], [`npy`] | NumPy's archives and arrays |
-//! | [`picture`] | pictures: PNG, JPEG, WebP |
+//! | [`picture`] | reading pictures: PNG, JPEG, WebP |
+//! | [`png`] | writing them |
 //! | [`depth_png`] | depth as KITTI stores it |
 //! | [`ply`] | coloured point clouds |
 //!
@@ -19,6 +20,7 @@ pub mod npz;
 pub mod picture;
 mod picture_structure;
 pub mod ply;
+pub mod png;
 pub mod pth;
 pub mod safetensors;
 mod stored;

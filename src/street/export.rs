@@ -11,9 +11,9 @@
 use std::fs;
 use std::path::Path;
 
-use image::{ImageBuffer, Luma};
-
 use super::{Pose, Street, StreetConfig};
+use crate::formats::depth_png::write_depth_png;
+use crate::formats::png::write_png;
 use crate::{Error, Result};
 
 /// The day under which all drives are filed.
@@ -44,14 +44,10 @@ pub fn write(street: &Street, out: &Path) -> Result<()> {
         folder(&depths)?;
         for frame in 0..config.frames {
             let file = format!("{frame:010}.png");
-            let path = images.join(&file);
-            street.frame(sequence, frame).save(&path).map_err(|e| Error::file(&path, e.to_string()))?;
-            let path = depths.join(&file);
-            let depth = street.frame_depth(sequence, frame);
-            let raw: Vec<u16> = depth.metres.iter().map(|z| (z.min(DEEPEST) * 256.0 + 0.5) as u16).collect();
-            let picture = ImageBuffer::<Luma<u16>, _>::from_raw(depth.width as u32, depth.height as u32, raw);
-            let picture = picture.ok_or_else(|| Error::Failed("a depth map has too few values".to_owned()))?;
-            picture.save(&path).map_err(|e| Error::file(&path, e.to_string()))?;
+            write_png(images.join(&file), street.frame(sequence, frame))?;
+            let mut depth = street.frame_depth(sequence, frame);
+            depth.metres.iter_mut().for_each(|z| *z = z.min(DEEPEST));
+            write_depth_png(&depths.join(&file), &depth)?;
             if frame > 0 && frame + 1 < config.frames {
                 split += &format!("{DAY}/{name} {frame} l\n");
             }

@@ -12,6 +12,7 @@ use crate::error::{Error, Result};
 use crate::eval::metrics::{MeanMap, Metrics, Protocol, Report, Scale};
 use crate::eval::predictor::{Evaluation, Predictor, evaluate, evaluate_mean_map};
 use crate::formats::atomic::write_bytes_atomically;
+use crate::formats::png::write_png;
 use crate::report::colormap::disparity_to_image;
 
 /// `metrics.json`: what is known of it.
@@ -198,11 +199,7 @@ fn write_images(folder: &Path, predictor: &Predictor, data: &dyn Dataset) -> Res
             image::imageops::replace(&mut sheet, row, 0, i64::from(h) * r as i64);
         }
         let path = folder.join(format!("images/{i:02}.png"));
-        let mut bytes = std::io::Cursor::new(Vec::new());
-        sheet
-            .write_to(&mut bytes, image::ImageFormat::Png)
-            .map_err(|e| Error::file(&path, format!("could not be encoded: {e}")))?;
-        write_bytes_atomically(&path, bytes.get_ref())?;
+        write_png(&path, &sheet)?;
     }
     Ok(())
 }

@@ -1,5 +1,6 @@
 //! Depth from the disparity that a sigmoid gives.
 
+use crate::depth::inverse_depth_of_disparity;
 use crate::ops::elementwise::unary::{Function, Unary};
 use crate::ops::{Case, Input, apply1};
 use crate::tensor::{Float, Var};
@@ -14,8 +15,9 @@ pub struct DisparityToDepth {
 }
 
 impl DisparityToDepth {
-    fn range(self) -> f64 {
-        1.0 / self.min_depth - 1.0 / self.max_depth
+    /// a and b of `1 / (a + b d)`.
+    fn line<T: Float>(self) -> [T; 2] {
+        inverse_depth_of_disparity(self.min_depth, self.max_depth).map(T::of)
     }
 }
 
@@ -23,12 +25,14 @@ impl Function for DisparityToDepth {
     const FROM_RESULT: bool = true;
     #[inline(always)]
     fn f<T: Float>(self, x: T) -> T {
-        T::ONE / x.mul_add(T::of(self.range()), T::of(1.0 / self.max_depth))
+        let [a, b] = self.line();
+        T::ONE / x.mul_add(b, a)
     }
     /// -(1/min - 1/max) y^2.
     #[inline(always)]
     fn df<T: Float>(self, y: T) -> T {
-        y * y * T::of(-self.range())
+        let [_, b] = self.line::<T>();
+        y * y * -b
     }
     fn cases() -> Vec<Case<Unary<Self>>> {
         let op = |min_depth, max_depth| Unary(DisparityToDepth { min_depth, max_depth });

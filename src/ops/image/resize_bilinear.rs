@@ -1,5 +1,6 @@
 //! Bilinear resizing.
 
+use crate::depth::half_pixel;
 use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::pool::Buffer;
@@ -37,7 +38,7 @@ impl ResizeBilinear {
                 let at = match self.align_corners {
                     true if to > 1 => (i * last) as f64 / (to - 1) as f64,
                     true => 0.0,
-                    false => ((i as f64 + 0.5) * from as f64 / to as f64 - 0.5).max(0.0),
+                    false => half_pixel(i, from, to),
                 };
                 let low = (at as usize).min(last);
                 let weight = if low == last { 0.0 } else { at - low as f64 };
