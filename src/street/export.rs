@@ -47,7 +47,7 @@ pub fn write(street: &Street, out: &Path) -> Result<()> {
             write_png(images.join(&file), street.frame(sequence, frame))?;
             let mut depth = street.frame_depth(sequence, frame);
             depth.metres.iter_mut().for_each(|z| *z = z.min(DEEPEST));
-            write_depth_png(&depths.join(&file), &depth)?;
+            write_depth_png(depths.join(&file), &depth)?;
             if frame > 0 && frame + 1 < config.frames {
                 split += &format!("{DAY}/{name} {frame} l\n");
             }

@@ -411,7 +411,7 @@ impl<T: Float> Op<T> for ConvRelativePosition {
                             |x, k, sum| {
                                 let lanes = k * LANES..((k + 1) * LANES).min(channels);
                                 let out = &mut out[x * stride + 2 * channels..][..channels][lanes];
-                                put(accum, out.iter_mut().zip(sum).map(|(o, s)| (o, s)));
+                                put(accum, out.iter_mut().zip(sum));
                             },
                         );
                     },

@@ -191,7 +191,7 @@ impl Kernel {
         let pieces = out.chunks_mut(height * n).flat_map(|sample| sample.chunks_mut(tile * n)).enumerate();
         parallel::for_each_piece(pieces, 64 * x.len(), |(i, out)| {
             let (sample, first) = (i / tiles, i % tiles * tile);
-            let (x, y, g) = (Rows::of(x, sample), Rows::of(y, sample), Rows::of(g, sample));
+            let images = [x, y, g].map(|x| Rows::of(x, sample));
             let end = first + out.len() / n;
             let mut scratch = Scratch::new(n, channels);
             let mut rows = out.chunks_exact_mut(n).zip(first..);
@@ -200,7 +200,7 @@ impl Kernel {
                     #[inline(always)]
                     || {
                         if self.ssim != 0.0 {
-                            self.map_row(x, y, g, row, channels, &mut scratch);
+                            self.map_row(images, row, channels, &mut scratch);
                         }
                         // A row is finished once the maps of the row below it are there (or there is none).
                         let ready = if row + 1 == height { 2 } else { 1 };
@@ -208,7 +208,7 @@ impl Kernel {
                             if (row > first || row + 1 == height)
                                 && let Some((out, at)) = rows.next()
                             {
-                                self.finish_row(x, y, g, at, channels, &mut scratch, out, accum);
+                                self.finish_row(images, at, channels, &mut scratch, out, accum);
                             }
                         }
                     },
@@ -219,15 +219,7 @@ impl Kernel {
 
     /// The derivatives by the window means of one row, summed over neighbouring windows, into its place in the ring.
     #[inline(always)]
-    fn map_row<T: Float>(
-        &self,
-        x: Rows<T>,
-        y: Rows<T>,
-        g: Rows<T>,
-        row: usize,
-        channels: usize,
-        scratch: &mut Scratch<T>,
-    ) {
+    fn map_row<T: Float>(&self, [x, y, g]: [Rows<T>; 3], row: usize, channels: usize, scratch: &mut Scratch<T>) {
         let Scratch { stats, upstream, maps, ring } = scratch;
         let n = x.len;
         expand(g.row(row), upstream, channels);
@@ -262,12 +254,9 @@ impl Kernel {
 
     /// The gradient of one row, of the maps of the rows around it.
     #[inline(always)]
-    #[allow(clippy::too_many_arguments)]
     fn finish_row<T: Float>(
         &self,
-        x: Rows<T>,
-        y: Rows<T>,
-        g: Rows<T>,
+        [x, y, g]: [Rows<T>; 3],
         row: usize,
         channels: usize,
         scratch: &mut Scratch<T>,

@@ -122,20 +122,19 @@ impl Slices {
         }
     }
 
-    /// Adds the gradient of one operand (`side`) in one slice, with its derivative `by(a, b)`.
+    /// Adds the gradient of one operand (`side`) in one slice, with its derivative `by(a, b)`; constant derivatives need
+    /// no operands.
     #[inline(always)]
-    #[allow(clippy::too_many_arguments)]
     fn gradient<T: Float>(
         &self,
         side: usize,
         out: &mut [T],
         g: &[T],
-        a: &[T],
-        b: &[T],
-        saved: bool,
+        operands: Option<[&[T]; 2]>,
         by: impl Fn(T, T) -> T,
     ) {
         let n = self.run;
+        let ([a, b], saved) = (operands.unwrap_or([g, g]), operands.is_some());
         for_each_run(&self.shape, self.strides[0], self.strides[1], |io, ia, ib| {
             let to = [ia, ib][side];
             let g = &g[io..io + n];
@@ -263,14 +262,13 @@ where
                     begin_sum(out, accum);
                     for i in first * repeats..(first + 1) * repeats {
                         let g = &g.data()[i * slices.result..][..slices.result];
-                        // Functions whose derivatives are constant never look at their arguments.
-                        let (a, b) = operands
-                            .map_or((g, g), |(a, b)| (&a[i * slices.operands[0]..], &b[i * slices.operands[1]..]));
+                        let [first_a, first_b] = slices.operands.map(|own| i * own);
+                        let operands = operands.map(|(a, b)| [&a[first_a..], &b[first_b..]]);
                         simd::dispatch(
                             #[inline(always)]
                             || match side {
-                                0 => slices.gradient::<T>(0, out, g, a, b, operands.is_some(), F::da),
-                                _ => slices.gradient::<T>(1, out, g, a, b, operands.is_some(), F::db),
+                                0 => slices.gradient(0, out, g, operands, F::da),
+                                _ => slices.gradient(1, out, g, operands, F::db),
                             },
                         );
                     }

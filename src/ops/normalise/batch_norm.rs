@@ -10,7 +10,7 @@ use crate::ops::support::put::put;
 use crate::ops::support::sums::add_sums;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply, apply1};
 use crate::tensor::pool::Buffer;
-use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
 pub use crate::ops::support::epilogue::Activation;
 
@@ -124,11 +124,32 @@ fn normalise<T: Float>(s: &Saved<T>, activation: Activation, tile: usize) -> Ten
     with_activation!(activation, |f| normalise_with(s, f, tile))
 }
 
+/// What the kernels read beside a row: for each of its channels the mean, weight / sqrt(var + eps) and the bias, repeated
+/// to the width of the rows that are read at a time.
+struct Lanes<T: Float> {
+    width: usize,
+    mean: Buffer<T>,
+    scale: Buffer<T>,
+    bias: Buffer<T>,
+}
+
+impl<T: Float> Lanes<T> {
+    fn of(s: &Saved<T>) -> Self {
+        let width = width(s.mean.data().len());
+        let [mean, scale, bias] =
+            [s.mean.data(), &scale(s.weight.data(), &s.rstd), s.bias.data()].map(|numbers| repeat(width, numbers));
+        Lanes { width, mean, scale, bias }
+    }
+
+    /// (mean, scale, bias) of each number of a row.
+    #[inline(always)]
+    fn iter(&self) -> impl Iterator<Item = (T, T, T)> {
+        self.mean.iter().zip(self.scale.iter()).zip(self.bias.iter()).map(|((&m, &s), &b)| (m, s, b))
+    }
+}
+
 fn normalise_with<T: Float>(s: &Saved<T>, act: impl Function, tile: usize) -> Tensor<T> {
-    let c = s.x.shape().last();
-    let (chunk, width) = (tile * c, width(c));
-    let [mean, scale, bias] =
-        [s.mean.data(), &scale(s.weight.data(), &s.rstd), s.bias.data()].map(|numbers| repeat(width, numbers));
+    let (lanes, chunk) = (Lanes::of(s), tile * s.x.shape().last());
     Tensor::build(*s.x.shape(), |out| {
         let work = 4 * out.len();
         parallel::for_each_chunk(out, chunk, work, |i, out| {
@@ -136,9 +157,8 @@ fn normalise_with<T: Float>(s: &Saved<T>, act: impl Function, tile: usize) -> Te
             simd::dispatch(
                 #[inline(always)]
                 || {
-                    for (out, x) in out.chunks_mut(width).zip(x.chunks(width)) {
-                        let lanes = mean.iter().zip(scale.iter()).zip(bias.iter());
-                        for ((y, &x), ((&m, &s), &b)) in out.iter_mut().zip(x).zip(lanes) {
+                    for (out, x) in out.chunks_mut(lanes.width).zip(x.chunks(lanes.width)) {
+                        for ((y, &x), (m, s, b)) in out.iter_mut().zip(x).zip(lanes.iter()) {
                             *y = act.f((x - m).mul_add(s, b));
                         }
                     }
@@ -172,80 +192,104 @@ fn backward_with<T: Float>(
     g: Tensor<T>,
     sink: &mut GradSink<T>,
 ) {
-    let c = s.x.shape().last();
-    let rows = s.x.shape().rows();
-    let (chunk, width) = (tile * c, width(c));
-    let (x, g) = (s.x.data(), g.data());
-    let scale = scale(s.weight.data(), &s.rstd);
-    let [mean_l, scale_l, bias_l] = [s.mean.data(), &scale, s.bias.data()].map(|numbers| repeat(width, numbers));
-    let (mut dweight, mut dbias) = (vec![0.0; c], vec![0.0; c]);
-    if moving || sink.wants(1) || sink.wants(2) {
-        let mut parts = Buffer::<T>::stale(rows.div_ceil(tile) * 2 * c);
-        parallel::for_each_chunk(&mut parts, 2 * c, 4 * x.len(), |i, part| {
-            let end = ((i + 1) * chunk).min(x.len());
-            let (x, g) = (&x[i * chunk..end], &g[i * chunk..end]);
-            let (mut plain, mut centred) = (Buffer::<T>::stale(width), Buffer::<T>::stale(width));
-            let (dbias, dweight) = part.split_at_mut(c);
-            simd::dispatch(
-                #[inline(always)]
-                || {
-                    plain.fill(T::ZERO);
-                    centred.fill(T::ZERO);
-                    for (x, g) in x.chunks(width).zip(g.chunks(width)) {
-                        let lanes = mean_l.iter().zip(scale_l.iter()).zip(bias_l.iter());
-                        let sums = plain.iter_mut().zip(centred.iter_mut());
-                        for (((p, q), (&x, &g)), ((&m, &s), &b)) in sums.zip(x.iter().zip(g)).zip(lanes) {
-                            let d = x - m;
-                            let dz = g * act.slope(d.mul_add(s, b));
-                            *p += dz;
-                            *q = dz.mul_add(d, *q);
-                        }
-                    }
-                    fold(dbias, &plain);
-                    fold(dweight, &centred);
-                },
-            );
-        });
-        for part in parts.chunks_exact(2 * c) {
-            dbias.iter_mut().zip(&part[..c]).for_each(|(s, p)| *s += p.f64());
-            dweight.iter_mut().zip(&part[c..]).for_each(|(s, p)| *s += p.f64());
-        }
-        dweight.iter_mut().zip(&s.rstd).for_each(|(d, r)| *d *= r.f64());
-    }
+    let (lanes, c) = (Lanes::of(&s), s.x.shape().last());
+    let [dbias, dweight] = if moving || sink.wants(1) || sink.wants(2) {
+        parameter_gradients(&s, act, &lanes, tile * c, g.data())
+    } else {
+        [vec![0.0; c], vec![0.0; c]]
+    };
     sink.accumulate(0, |out, accum| {
-        let n = rows as f64;
+        // What the movement of the statistics takes from each channel: a number, and one times x - mean.
+        let (n, scale) = (s.x.shape().rows() as f64, scale(s.weight.data(), &s.rstd));
         let share = |sum: &[f64], factor: &dyn Fn(usize) -> f64| -> Vec<T> {
             if !moving {
                 return vec![T::ZERO; c];
             }
             sum.iter().enumerate().map(|(k, d)| T::of(scale[k].f64() * factor(k) * d / n)).collect()
         };
-        let shift = share(&dbias, &|_| 1.0);
-        let slope = share(&dweight, &|k| s.rstd[k].f64());
-        let [shift, slope] = [&shift[..], &slope[..]].map(|numbers| repeat(width, numbers));
-        let work = 6 * out.len();
-        parallel::for_each_chunk(out, chunk, work, |i, out| {
-            let (x, g) = (&x[i * chunk..][..out.len()], &g[i * chunk..][..out.len()]);
-            simd::dispatch(
-                #[inline(always)]
-                || {
-                    for (out, (x, g)) in out.chunks_mut(width).zip(x.chunks(width).zip(g.chunks(width))) {
-                        let lanes = mean_l.iter().zip(scale_l.iter()).zip(bias_l.iter());
-                        let terms = out.iter_mut().zip(x.iter().zip(g)).zip(lanes.zip(shift.iter().zip(slope.iter())));
-                        put(
-                            accum,
-                            terms.map(|((o, (&x, &g)), (((&m, &s), &b), (&p, &q)))| {
-                                let d = x - m;
-                                (o, (g * act.slope(d.mul_add(s, b))).mul_add(s, -d.mul_add(q, p)))
-                            }),
-                        );
-                    }
-                },
-            );
-        });
+        let shares = [share(&dbias, &|_| 1.0), share(&dweight, &|k| s.rstd[k].f64())];
+        input_gradient(out, accum, [s.x.data(), g.data()], act, &lanes, tile * c, shares);
     });
     add_sums(sink, 1, &dweight);
     add_sums(sink, 2, &dbias);
+}
+
+/// The gradients of bias and weight: sums of dz and of dz xhat, of the rows of each chunk and then of all chunks.
+fn parameter_gradients<T: Float>(
+    s: &Saved<T>,
+    act: impl Function,
+    lanes: &Lanes<T>,
+    chunk: usize,
+    g: &[T],
+) -> [Vec<f64>; 2] {
+    let (x, c, width) = (s.x.data(), s.x.shape().last(), lanes.width);
+    let mut parts = Buffer::<T>::stale(x.len().div_ceil(chunk) * 2 * c);
+    parallel::for_each_chunk(&mut parts, 2 * c, 4 * x.len(), |i, part| {
+        let end = ((i + 1) * chunk).min(x.len());
+        let (x, g) = (&x[i * chunk..end], &g[i * chunk..end]);
+        let (mut plain, mut centred) = (Buffer::<T>::stale(width), Buffer::<T>::stale(width));
+        let (dbias, dweight) = part.split_at_mut(c);
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                plain.fill(T::ZERO);
+                centred.fill(T::ZERO);
+                for (x, g) in x.chunks(width).zip(g.chunks(width)) {
+                    let sums = plain.iter_mut().zip(centred.iter_mut());
+                    for (((p, q), (&x, &g)), (m, s, b)) in sums.zip(x.iter().zip(g)).zip(lanes.iter()) {
+                        let d = x - m;
+                        let dz = g * act.slope(d.mul_add(s, b));
+                        *p += dz;
+                        *q = dz.mul_add(d, *q);
+                    }
+                }
+                fold(dbias, &plain);
+                fold(dweight, &centred);
+            },
+        );
+    });
+    let mut sums = [vec![0.0; c], vec![0.0; c]];
+    for part in parts.chunks_exact(2 * c) {
+        for (sums, part) in sums.iter_mut().zip(part.chunks_exact(c)) {
+            sums.iter_mut().zip(part).for_each(|(s, p)| *s += p.f64());
+        }
+    }
+    sums[1].iter_mut().zip(&s.rstd).for_each(|(d, r)| *d *= r.f64());
+    sums
+}
+
+/// `dx = dz scale - shift - (x - mean) slope`, where `shift` and `slope` are the channels' shares.
+fn input_gradient<T: Float>(
+    out: &mut [T],
+    accum: Accum,
+    [x, g]: [&[T]; 2],
+    act: impl Function,
+    lanes: &Lanes<T>,
+    chunk: usize,
+    shares: [Vec<T>; 2],
+) {
+    let width = lanes.width;
+    let [shift, slope] = shares.map(|numbers| repeat(width, &numbers));
+    let work = 6 * out.len();
+    parallel::for_each_chunk(out, chunk, work, |i, out| {
+        let (x, g) = (&x[i * chunk..][..out.len()], &g[i * chunk..][..out.len()]);
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                for (out, (x, g)) in out.chunks_mut(width).zip(x.chunks(width).zip(g.chunks(width))) {
+                    let terms =
+                        out.iter_mut().zip(x.iter().zip(g)).zip(lanes.iter()).zip(shift.iter().zip(slope.iter()));
+                    put(
+                        accum,
+                        terms.map(|(((o, (&x, &g)), (m, s, b)), (&p, &q))| {
+                            let d = x - m;
+                            (o, (g * act.slope(d.mul_add(s, b))).mul_add(s, -d.mul_add(q, p)))
+                        }),
+                    );
+                }
+            },
+        );
+    });
 }
 
 /// The channels, if vectors of as many numbers stand beside a nonempty x.

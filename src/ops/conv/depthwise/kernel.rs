@@ -101,12 +101,10 @@ fn band(row: usize) -> usize {
 /// the same number of columns.
 ///
 /// `tile`: rows of the output handed to a thread at a time, chosen by shape if 0; `done` is called with each of them.
-#[allow(clippy::too_many_arguments)]
 pub(crate) fn forward<T: Float>(
     window: &Window,
     x: Rows<T>,
-    w: &[T],
-    bias: Option<&[T]>,
+    (w, bias): (&[T], Option<&[T]>),
     y: RowsMut<T>,
     accum: Accum,
     tile: usize,
@@ -351,7 +349,7 @@ pub(crate) fn input_gradient<T: Float>(
             to.copy_from_slice(from);
         }
         let window = Window { height, width, padding: kh - 1 - window.padding, ..*window };
-        return forward(&window, g, &turned, None, dx, accum, tile, &|_| ());
+        return forward(&window, g, (&turned, None), dx, accum, tile, &|_| ());
     }
     let tile = if tile > 0 { tile } else { band(window.width * c * kh * kw) };
     parallel::for_each_chunk(dx.data, tile * window.width * stride, 2 * g.rows * c * kh * kw, |i, out| {

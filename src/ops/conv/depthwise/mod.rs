@@ -78,7 +78,7 @@ impl<T: Float> Op<T> for DepthwiseConv2d {
                 let x = Rows::dense(x.data(), x.shape().rows(), c);
                 let y = RowsMut::dense(out, shape.rows(), c);
                 let bias = b.map(|b| b.data());
-                kernel::forward(&window, x, w.data(), bias, y, Accum::Replace, self.tile, &|rows| finish.run(rows));
+                kernel::forward(&window, x, (w.data(), bias), y, Accum::Replace, self.tile, &|rows| finish.run(rows));
             })
         });
         (vec![y], (needs.get(1).then(|| x.clone()), needs.get(0).then(|| w.clone()), [*x.shape(), *w.shape()], kept))
@@ -246,7 +246,7 @@ mod tests {
             let g_part = Rows::columns(g.data(), out_rows, wide, first, c);
             let mut out = Tensor::full([out_rows, wide], 0.5);
             let to = RowsMut::columns(out.data_mut(), out_rows, wide, first, c);
-            kernel::forward(&window, x_part, w.data(), None, to, Accum::Replace, 0, &|_| ());
+            kernel::forward(&window, x_part, (w.data(), None), to, Accum::Replace, 0, &|_| ());
             assert!(columns(&out).reshape(*y.shape()).same_bits(y.value()));
             assert_eq!(out.data().iter().filter(|&&v| v == 0.5).count(), out_rows * (wide - c));
 
