@@ -41,3 +41,4 @@ pub use conv::depthwise::DepthwiseConv2d;
 pub use conv::transpose::ConvTranspose2d;
 pub use op::{Checked, CustomOp, Needs, Op, Registered, ShapeError};
 pub use support::epilogue::Activation;
+pub use support::tile::Tile;

@@ -75,7 +75,7 @@ proptest! {
     ) {
         let out = |d: usize| (size[d] - 1) * stride[d] + dilation[d] * (kernel[d] - 1) + extra[d] + 1;
         prop_assume!((0..2).all(|d| extra[d] < stride[d].max(dilation[d]) && out(d) > 2 * padding[d]));
-        let op = ConvTranspose2d { stride, padding, dilation, output_padding: extra, groups, tile: 0 };
+        let op = ConvTranspose2d { stride, padding, dilation, output_padding: extra, groups, tile: parallax::ops::Tile::AUTO };
         let x = distinct([1, size[0], size[1], groups * inner], 1);
         let w = distinct([kernel[0], kernel[1], outer, groups * inner], 2);
         let tape = Tape::new();

@@ -1,6 +1,7 @@
 //! Factorised attention: linear in the number of tokens, because keys meet values before queries.
 
 use super::head_products::Heads;
+use crate::ops::Tile;
 use crate::ops::support::put::put_run;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::gemm::Rows;
@@ -17,8 +18,8 @@ use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parall
 pub struct FactorisedAttention {
     /// Heads, which divide C.
     pub heads: usize,
-    /// Tokens handed to a thread at a time; chosen by shape if 0. A gradient check shrinks it to reach tile edges.
-    pub tile: usize,
+    /// Tokens handed to a thread at a time, chosen by the shapes by default.
+    pub tile: Tile,
 }
 
 /// The extents of an input.
@@ -55,7 +56,7 @@ impl FactorisedAttention {
             return Err(ShapeError::new(format!("{channels} channels are not q, k and v of {} heads", self.heads)));
         }
         let heads = Heads { heads: self.heads, c: channels / 3 / self.heads };
-        let tile = if self.tile > 0 { self.tile } else { ((1 << 15) / channels).max(16) };
+        let tile = self.tile.or(((1 << 15) / channels).max(16));
         Ok(Extents { batch, tokens, heads, tile })
     }
 }
@@ -268,7 +269,7 @@ fn contexts<T: Float>(e: &Extents, qkv: &[T]) -> (Statistics<T>, Buffer<T>) {
 
 impl Checked for FactorisedAttention {
     fn cases() -> Vec<Case<Self>> {
-        let op = |heads, tile| FactorisedAttention { heads, tile };
+        let op = |heads, tile| FactorisedAttention { heads, tile: Tile::of(tile) };
         let qkv = |batch: usize, tokens: usize, c: usize| [Input::uniform("qkv", [batch, tokens, 3 * c], -2.0, 2.0)];
         vec![
             Case::new("windows", op(8, 0), qkv(2, 4, 16)),
@@ -295,7 +296,7 @@ impl<T: Float> Var<T> {
     /// over the tokens.
     #[track_caller]
     pub fn factorised_attention(&self, heads: usize) -> Self {
-        apply1(FactorisedAttention { heads, tile: 0 }, &[self])
+        apply1(FactorisedAttention { heads, tile: Tile::AUTO }, &[self])
     }
 }
 
@@ -328,7 +329,7 @@ mod tests {
                 o.iter_mut().for_each(|x| *x = random.uniform(-3.0, 3.0));
             });
             let qkv = Var::constant(qkv);
-            let fast = apply1(FactorisedAttention { heads, tile: 16 }, &[&qkv]);
+            let fast = apply1(FactorisedAttention { heads, tile: Tile::of(16) }, &[&qkv]);
             let slow = composed(&qkv, heads);
             for (a, b) in fast.value().data().iter().zip(slow.value().data()) {
                 assert!((a - b).abs() < 1e-13, "{a} {b}");
@@ -342,7 +343,7 @@ mod tests {
         let low = f64::NEG_INFINITY;
         qkv.data_mut().iter_mut().skip(1).step_by(3).zip([low, low, -1000.0, -1000.0]).for_each(|(k, x)| *k = x);
         qkv.data_mut().iter_mut().skip(2).step_by(3).zip([7.0, 7.0, 1.0, 3.0]).for_each(|(v, x)| *v = x);
-        let y = apply1(FactorisedAttention { heads: 1, tile: 2 }, &[&Var::constant(qkv)]);
+        let y = apply1(FactorisedAttention { heads: 1, tile: Tile::of(2) }, &[&Var::constant(qkv)]);
         assert_eq!(y.value().data(), [2.0; 4]);
     }
 }

@@ -1,5 +1,6 @@
 //! The convolutional relative position encoding of factorised attention.
 
+use crate::ops::Tile;
 use crate::ops::support::put::{begin_sum, put};
 use crate::ops::support::sums::add_sums;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
@@ -23,8 +24,8 @@ pub struct ConvRelativePosition {
     pub heads: usize,
     /// For every window: its (odd) extent, and how many heads it serves.
     pub windows: Vec<(usize, usize)>,
-    /// Image rows a partial sum of the weight gradient covers; 8 if 0. A gradient check shrinks it to reach tile edges.
-    pub tile: usize,
+    /// Image rows a partial sum of the weight gradient covers; 8 by default.
+    pub tile: Tile,
 }
 
 /// The channels that are computed side by side.
@@ -96,7 +97,7 @@ impl ConvRelativePosition {
             })
             .collect();
         let pad = self.windows.iter().map(|w| w.0 / 2).max().unwrap_or(0);
-        let tile = if self.tile > 0 { self.tile } else { 8 };
+        let tile = self.tile.or(8);
         Ok(Plan { batch, height: self.height, width: self.width, channels, pad, blocks, taps, windows, tile })
     }
 }
@@ -464,7 +465,7 @@ impl Checked for ConvRelativePosition {
         let case = |name, batch: usize, size: [usize; 2], c: usize, windows: &[(usize, usize)], tile| {
             let [height, width] = size;
             let heads = windows.iter().map(|w| w.1).sum::<usize>();
-            let op = ConvRelativePosition { height, width, heads, windows: windows.to_vec(), tile };
+            let op = ConvRelativePosition { height, width, heads, windows: windows.to_vec(), tile: Tile::of(tile) };
             const NAMES: [[&str; 2]; 3] = [["w0", "b0"], ["w1", "b1"], ["w2", "b2"]];
             let mut inputs = vec![Input::random("qkv", [batch, height * width, 3 * c * heads])];
             for (&(window, heads), names) in windows.iter().zip(NAMES) {
@@ -502,7 +503,7 @@ impl<T: Float> Var<T> {
         let extents = windows.iter().map(|w| (w.0, w.1)).collect();
         let mut inputs = vec![self];
         windows.iter().for_each(|w| inputs.extend([w.2, w.3]));
-        apply1(ConvRelativePosition { height, width, heads, windows: extents, tile: 0 }, &inputs)
+        apply1(ConvRelativePosition { height, width, heads, windows: extents, tile: Tile::AUTO }, &inputs)
     }
 }
 

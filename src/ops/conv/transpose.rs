@@ -3,6 +3,7 @@
 use super::conv2d::geometry::{Beyond, Geometry};
 use super::conv2d::kernel;
 use super::conv2d::parts::whole;
+use crate::ops::Tile;
 use crate::ops::support::epilogue::Finish;
 use crate::ops::support::row_products::rows_of;
 use crate::ops::support::sums::bias_gradient;
@@ -31,8 +32,8 @@ pub struct ConvTranspose2d {
     pub output_padding: [usize; 2],
     /// Channels are cut into so many groups, each convolved for itself.
     pub groups: usize,
-    /// Rows of pixels handed to a thread at a time; chosen by shape if 0. A gradient check shrinks it.
-    pub tile: usize,
+    /// Rows of pixels handed to a thread at a time, chosen by the shapes by default.
+    pub tile: Tile,
 }
 
 impl Default for ConvTranspose2d {
@@ -43,7 +44,7 @@ impl Default for ConvTranspose2d {
             dilation: [1; 2],
             output_padding: [0; 2],
             groups: 1,
-            tile: 0,
+            tile: Tile::AUTO,
         }
     }
 }
@@ -222,10 +223,16 @@ impl Checked for ConvTranspose2d {
             case("one pixel is left", padded(1), [1, 1, 1, 2], [3, 3, 2, 2], false),
             case("1x1", plain, [2, 3, 2, 3], [1, 1, 4, 3], true),
             case("1x1, stride 2", by(2), [2, 3, 2, 3], [1, 1, 2, 3], false),
-            case("tile less one", ConvTranspose2d { tile: 4, ..by(2) }, [1, 3, 2, 2], [3, 3, 2, 2], false),
-            case("a whole tile", ConvTranspose2d { tile: 4, ..by(2) }, [1, 4, 2, 2], [3, 3, 2, 2], false),
-            case("tile and one", ConvTranspose2d { tile: 4, ..by(2) }, [1, 5, 2, 2], [3, 3, 2, 2], false),
-            case("a tile across images", ConvTranspose2d { tile: 2, ..padded(1) }, [2, 3, 3, 2], [3, 3, 2, 2], true),
+            case("tile less one", ConvTranspose2d { tile: Tile::of(4), ..by(2) }, [1, 3, 2, 2], [3, 3, 2, 2], false),
+            case("a whole tile", ConvTranspose2d { tile: Tile::of(4), ..by(2) }, [1, 4, 2, 2], [3, 3, 2, 2], false),
+            case("tile and one", ConvTranspose2d { tile: Tile::of(4), ..by(2) }, [1, 5, 2, 2], [3, 3, 2, 2], false),
+            case(
+                "a tile across images",
+                ConvTranspose2d { tile: Tile::of(2), ..padded(1) },
+                [2, 3, 3, 2],
+                [3, 3, 2, 2],
+                true,
+            ),
             case("empty batch", by(2), [0, 3, 2, 2], [3, 3, 3, 2], true).flat(),
         ]
     }
@@ -308,7 +315,7 @@ mod tests {
                 let conv = Conv2d { stride, padding, dilation, groups, ..Conv2d::default() };
                 let convolved = y.conv2d(&w, None, conv);
                 let x = noise(*convolved.shape(), &mut random);
-                let op = ConvTranspose2d { stride, padding, dilation, output_padding, groups, tile: 0 };
+                let op = ConvTranspose2d { stride, padding, dilation, output_padding, groups, tile: Tile::AUTO };
                 let back = x.conv_transpose2d(&w, None, op);
                 assert_eq!(back.shape(), y.shape());
                 let (left, right) = ((&convolved * &x).sum_all(), (&back * &y).sum_all());

@@ -1,5 +1,6 @@
 //! The per-pixel minimum over candidate losses (Godard et al., 1806.01260), and its mean.
 
+use crate::ops::Tile;
 use crate::ops::support::put::put;
 use crate::ops::support::sums::pairwise_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply};
@@ -12,13 +13,13 @@ use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, sim
 /// to give. Of several equal candidates the first wins. A NaN wins, so that the mean shows it.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct MinReprojection {
-    /// Pixels handed to a thread at a time, each a partial sum; 2^13 if 0. A gradient check shrinks it.
-    pub tile: usize,
+    /// Pixels handed to a thread at a time, each a partial sum; 2^13 by default.
+    pub tile: Tile,
 }
 
 impl MinReprojection {
     fn tile(&self) -> usize {
-        if self.tile > 0 { self.tile } else { 1 << 13 }
+        self.tile.or(1 << 13)
     }
 }
 
@@ -88,7 +89,7 @@ impl<T: Float> Op<T> for MinReprojection {
 
 impl Checked for MinReprojection {
     fn cases() -> Vec<Case<Self>> {
-        let op = |tile| MinReprojection { tile };
+        let op = |tile| MinReprojection { tile: Tile::of(tile) };
         let inputs = |names: &[&'static str]| -> Vec<Input> {
             names.iter().map(|name| Input::random(name, [2, 3, 5, 1])).collect()
         };

@@ -1,6 +1,7 @@
 //! The photometric loss: structure and colour, in one op.
 
-use super::ssim::{Kernel, pair, tile};
+use super::ssim::{Kernel, TILE, pair};
+use crate::ops::Tile;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 
@@ -12,14 +13,14 @@ use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 pub struct Photometric {
     /// The weight of the structural part: 0.85 as published.
     pub ssim_weight: f64,
-    /// Rows handed to a thread at a time; 16 if 0. A gradient check shrinks it to reach tile edges.
-    pub tile: usize,
+    /// Rows handed to a thread at a time; 16 by default.
+    pub tile: Tile,
 }
 
 impl Photometric {
     fn kernel(self, channels: usize) -> Kernel {
         let n = channels as f64;
-        Kernel { ssim: self.ssim_weight / n, l1: (1.0 - self.ssim_weight) / n, tile: tile(self.tile), sum: true }
+        Kernel { ssim: self.ssim_weight / n, l1: (1.0 - self.ssim_weight) / n, tile: self.tile.or(TILE), sum: true }
     }
 }
 
@@ -61,7 +62,7 @@ impl<T: Float> Op<T> for Photometric {
 
 impl Checked for Photometric {
     fn cases() -> Vec<Case<Self>> {
-        let op = |ssim_weight, tile| Photometric { ssim_weight, tile };
+        let op = |ssim_weight, tile| Photometric { ssim_weight, tile: Tile::of(tile) };
         let images = |shape: [usize; 4]| {
             // Evenly spaced, and a quarter of the spacing apart: no pixel of one equals one of the other.
             let quarter = 0.25 / shape.iter().product::<usize>() as f64;
@@ -94,6 +95,6 @@ impl<T: Float> Var<T> {
     /// channels]`: structural dissimilarity with weight `ssim_weight`, mean absolute difference with the rest.
     #[track_caller]
     pub fn photometric(&self, target: &Self, ssim_weight: f64) -> Self {
-        apply1(Photometric { ssim_weight, tile: 0 }, &[self, target])
+        apply1(Photometric { ssim_weight, tile: Tile::AUTO }, &[self, target])
     }
 }

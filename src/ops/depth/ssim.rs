@@ -5,6 +5,7 @@
 //! channels at once. Nothing but the inputs is saved: the backward pass forms the means again, which costs less than
 //! writing and reading them as images.
 
+use crate::ops::Tile;
 use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, pool::Buffer, simd};
@@ -18,9 +19,12 @@ const C2: f64 = 0.03 * 0.03;
 /// SSIM lies within [-1, 1], so the clamp only catches rounding: its derivative is 1 on the bounds and 0 beyond.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct SsimLoss {
-    /// Rows handed to a thread at a time; 16 if 0. A gradient check shrinks it to reach tile edges.
-    pub tile: usize,
+    /// Rows handed to a thread at a time.
+    pub tile: Tile,
 }
+
+/// Rows handed to a thread at a time, unless said otherwise.
+pub(crate) const TILE: usize = 16;
 
 /// `ssim * clamp((1 - SSIM) / 2, 0, 1) + l1 * |x - y|` for every element; the kernel of two ops.
 #[derive(Clone, Copy, Debug)]
@@ -331,14 +335,9 @@ pub(crate) fn pair(inputs: &[Shape]) -> Result<[usize; 4], ShapeError> {
     }
 }
 
-/// The tile, or what it is by default.
-pub(crate) fn tile(tile: usize) -> usize {
-    if tile > 0 { tile } else { 16 }
-}
-
 impl SsimLoss {
     fn kernel(self) -> Kernel {
-        Kernel { ssim: 1.0, l1: 0.0, tile: tile(self.tile), sum: false }
+        Kernel { ssim: 1.0, l1: 0.0, tile: self.tile.or(TILE), sum: false }
     }
 }
 
@@ -370,7 +369,7 @@ impl<T: Float> Op<T> for SsimLoss {
 
 impl Checked for SsimLoss {
     fn cases() -> Vec<Case<Self>> {
-        let op = |tile| SsimLoss { tile };
+        let op = |tile| SsimLoss { tile: Tile::of(tile) };
         let images = |shape: [usize; 4]| [Input::uniform("x", shape, 0.0, 1.0), Input::uniform("y", shape, 0.0, 1.0)];
         vec![
             Case::new("colour", op(0), images([2, 5, 7, 3])),

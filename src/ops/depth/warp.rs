@@ -4,6 +4,7 @@
 //! four pixels around each place are fetched one place after the other. Nothing but the inputs is saved: projecting
 //! again in the backward pass costs less than writing the coordinates out and reading them back.
 
+use crate::ops::Tile;
 use crate::ops::support::put::{begin_sum, put, put_rounded};
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, pool::Buffer, simd};
@@ -24,8 +25,8 @@ pub struct Warp {
     /// Whether the projected pixel itself is sampled. If not, the published combination: a grid made for aligned
     /// corners is sampled as one for corners that are not, so that u becomes `u W / (W - 1) - 1/2`.
     pub consistent: bool,
-    /// Rows handed to a thread at a time; 8 if 0. A gradient check shrinks it to reach tile edges.
-    pub tile: usize,
+    /// Rows handed to a thread at a time; 8 by default.
+    pub tile: Tile,
 }
 
 /// Pixels worked on side by side.
@@ -125,7 +126,7 @@ fn quad<T>(image: &[T], first: usize, row: usize, channels: usize) -> [&[T]; 4] 
 
 impl Warp {
     fn tile(&self) -> usize {
-        if self.tile > 0 { self.tile } else { 8 }
+        self.tile.or(8)
     }
 
     /// Folds intrinsics and transform of one sample into a projection.
@@ -481,7 +482,7 @@ impl Checked for Warp {
             |t: usize| Input::values("transform", [2, 3, 4], pose.map(|p| p.map(|x| x * t as f64)).concat());
         // The depth decides which pixels a place lies between: it is fixed, so that none is on the edge of two.
         let case = |name, consistent, tile, [height, width, channels]: [usize; 3]| {
-            let op = Warp { intrinsics: intrinsics(height, width), consistent, tile };
+            let op = Warp { intrinsics: intrinsics(height, width), consistent, tile: Tile::of(tile) };
             let source = Input::random("source", [2, height, width, channels]);
             Case::new(name, op, [source, Input::fixed("depth", [2, height, width, 1], 3.0, 6.0), transform(1)])
         };
@@ -508,7 +509,7 @@ impl<T: Float> Var<T> {
     /// See [`Warp`].
     #[track_caller]
     pub fn warp(&self, depth: &Self, transform: &Self, intrinsics: &[[f64; 4]], consistent: bool) -> Self {
-        let op = Warp { intrinsics: intrinsics.to_vec(), consistent, tile: 0 };
+        let op = Warp { intrinsics: intrinsics.to_vec(), consistent, tile: Tile::AUTO };
         apply1(op, &[self, depth, transform])
     }
 }

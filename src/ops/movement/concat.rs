@@ -1,5 +1,6 @@
 //! Concatenation along one dimension.
 
+use crate::ops::Tile;
 use crate::ops::support::put::put_run;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::simd::{self, copy_run};
@@ -10,8 +11,8 @@ use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 pub struct Concat {
     /// The dimension.
     pub axis: usize,
-    /// Runs handed to a thread at a time; chosen by shape if 0. A gradient check shrinks it to reach tile edges.
-    pub tile: usize,
+    /// Runs handed to a thread at a time, chosen by the shapes by default.
+    pub tile: Tile,
 }
 
 /// Elements copied by a thread at a time, about.
@@ -24,7 +25,7 @@ impl Concat {
     }
 
     fn tile(&self, run: usize) -> usize {
-        if self.tile > 0 { self.tile } else { (CHUNK / run.max(1)).max(1) }
+        self.tile.or((CHUNK / run.max(1)).max(1))
     }
 }
 
@@ -107,8 +108,8 @@ impl<T: Float> Op<T> for Concat {
 impl Checked for Concat {
     fn cases() -> Vec<Case<Self>> {
         let part = |name, shape: &[usize]| Input::random(name, shape);
-        let at = |axis| Concat { axis, tile: 0 };
-        let tiled = |tile| Concat { axis: 2, tile };
+        let at = |axis| Concat { axis, tile: Tile::AUTO };
+        let tiled = |tile| Concat { axis: 2, tile: Tile::of(tile) };
         let two = |n| [part("a", &[n, 2, 3]), part("b", &[n, 2, 4])];
         vec![
             Case::new(
@@ -132,7 +133,7 @@ impl<T: Float> Var<T> {
     /// The parts, any number of them, one after the other along dimension `axis`; the other extents are the same.
     #[track_caller]
     pub fn concat(parts: &[&Var<T>], axis: usize) -> Var<T> {
-        apply1(Concat { axis, tile: 0 }, parts)
+        apply1(Concat { axis, tile: Tile::AUTO }, parts)
     }
 }
 

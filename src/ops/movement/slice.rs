@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 
+use crate::ops::Tile;
 use crate::ops::support::put::{begin_sum, put_run};
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
@@ -15,8 +16,8 @@ pub struct Slice {
     pub start: usize,
     /// One past the last.
     pub end: usize,
-    /// Runs handed to a thread at a time; chosen by shape if 0. A gradient check shrinks it to reach tile edges.
-    pub tile: usize,
+    /// Runs handed to a thread at a time, chosen by the shapes by default.
+    pub tile: Tile,
 }
 
 /// Elements copied by a thread at a time, about.
@@ -30,7 +31,7 @@ impl Slice {
     }
 
     fn tile(&self, run: usize) -> usize {
-        if self.tile > 0 { self.tile } else { (CHUNK / run.max(1)).max(1) }
+        self.tile.or((CHUNK / run.max(1)).max(1))
     }
 }
 
@@ -93,8 +94,8 @@ impl<T: Float> Op<T> for Slice {
 impl Checked for Slice {
     fn cases() -> Vec<Case<Self>> {
         let x = |shape: &[usize]| Input::random("x", shape);
-        let of = |axis, range: Range<usize>| Slice { axis, start: range.start, end: range.end, tile: 0 };
-        let tiled = |tile| Slice { axis: 1, start: 1, end: 3, tile };
+        let of = |axis, range: Range<usize>| Slice { axis, start: range.start, end: range.end, tile: Tile::AUTO };
+        let tiled = |tile| Slice { axis: 1, start: 1, end: 3, tile: Tile::of(tile) };
         vec![
             Case::new("channels", of(3, 1..4), [x(&[2, 3, 2, 5])]),
             Case::new("first channels", of(3, 0..2), [x(&[2, 3, 2, 5])]),
@@ -114,7 +115,7 @@ impl<T: Float> Var<T> {
     /// The elements `range` of dimension `axis`; the other dimensions stay whole.
     #[track_caller]
     pub fn slice(&self, axis: usize, range: Range<usize>) -> Self {
-        apply1(Slice { axis, start: range.start, end: range.end, tile: 0 }, &[self])
+        apply1(Slice { axis, start: range.start, end: range.end, tile: Tile::AUTO }, &[self])
     }
 }
 

@@ -4,6 +4,7 @@
 //! Everything is a loop over rows of C channels. So that few channels vectorise as well as many, a row is read together
 //! with its followers, up to a `width` that is a multiple of the channels, and per-channel numbers are repeated to it.
 
+use crate::ops::Tile;
 use crate::ops::elementwise::unary::Function;
 use crate::ops::support::epilogue::{repeat, width, with_activation};
 use crate::ops::support::put::put;
@@ -22,8 +23,8 @@ pub struct BatchNorm {
     pub eps: f64,
     /// What follows.
     pub activation: Activation,
-    /// Rows handed to a thread at a time; chosen by shape if 0. A gradient check shrinks it to reach tile edges.
-    pub tile: usize,
+    /// Rows handed to a thread at a time.
+    pub tile: Tile,
 }
 
 /// The same with given statistics: inputs x, weight, bias, mean and variance, the last two constants.
@@ -33,8 +34,8 @@ pub struct BatchNormEval {
     pub eps: f64,
     /// What follows.
     pub activation: Activation,
-    /// Rows handed to a thread at a time; chosen by shape if 0. A gradient check shrinks it to reach tile edges.
-    pub tile: usize,
+    /// Rows handed to a thread at a time.
+    pub tile: Tile,
 }
 
 /// What the backward pass needs: x, from which the normalised value is computed again, and C numbers of each kind.
@@ -48,8 +49,8 @@ pub struct Saved<T: Float> {
 }
 
 /// Rows a tile: about 2^14 elements, which stay in the inner caches between the two passes of the statistics.
-fn tile_rows(tile: usize, c: usize) -> usize {
-    if tile > 0 { tile } else { ((1 << 14) / c).max(1) }
+fn tile_rows(tile: Tile, c: usize) -> usize {
+    tile.or(((1 << 14) / c).max(1))
 }
 
 /// Sums of lanes that belong to the same channel.
@@ -390,7 +391,7 @@ impl Checked for BatchNorm {
     fn cases() -> Vec<Case<Self>> {
         let mut cases = Vec::new();
         for activation in Activation::ALL {
-            let op = |tile| BatchNorm { eps: 1e-3, activation, tile };
+            let op = |tile| BatchNorm { eps: 1e-3, activation, tile: Tile::of(tile) };
             // 1, 3, 8, 17 and 128 channels: one and several rows side by side, with and without a remainder.
             let inputs = |rows: &[usize], c: usize| {
                 let shape: Vec<usize> = rows.iter().copied().chain([c]).collect();
@@ -423,7 +424,7 @@ impl Checked for BatchNormEval {
     fn cases() -> Vec<Case<Self>> {
         let mut cases = Vec::new();
         for activation in Activation::ALL {
-            let op = |tile| BatchNormEval { eps: 1e-3, activation, tile };
+            let op = |tile| BatchNormEval { eps: 1e-3, activation, tile: Tile::of(tile) };
             let inputs = |rows: &[usize], c: usize| {
                 let shape: Vec<usize> = rows.iter().copied().chain([c]).collect();
                 let why = "statistics of evaluation are frozen buffers";
@@ -468,7 +469,7 @@ impl<T: Float> Var<T> {
         eps: f64,
         activation: Activation,
     ) -> (Self, Tensor<T>, Tensor<T>) {
-        let outputs = apply(BatchNorm { eps, activation, tile: 0 }, &[self, weight, bias]);
+        let outputs = apply(BatchNorm { eps, activation, tile: Tile::AUTO }, &[self, weight, bias]);
         let [y, mean, var] = outputs.try_into().ok().expect("three outputs");
         (y, mean.into_value(), var.into_value())
     }
@@ -485,7 +486,10 @@ impl<T: Float> Var<T> {
         eps: f64,
         activation: Activation,
     ) -> Self {
-        apply1(BatchNormEval { eps, activation, tile: 0 }, &[self, weight, bias, &mean.detach(), &var.detach()])
+        apply1(
+            BatchNormEval { eps, activation, tile: Tile::AUTO },
+            &[self, weight, bias, &mean.detach(), &var.detach()],
+        )
     }
 }
 
@@ -499,7 +503,7 @@ mod tests {
         let (rows, c) = (30_720, 32);
         let mut random = Random::new(1, 2);
         let x: Vec<f32> = (0..rows * c).map(|_| (300.0 + random.uniform(-1.0, 1.0)) as f32).collect();
-        let (mean, var) = statistics(&x, c, tile_rows(0, c));
+        let (mean, var) = statistics(&x, c, tile_rows(Tile::AUTO, c));
         for k in 0..c {
             let column = || x[k..].iter().step_by(c).map(|&x| x as f64);
             let m = column().sum::<f64>() / rows as f64;

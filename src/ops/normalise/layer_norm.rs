@@ -2,6 +2,7 @@
 
 use pulp::{Simd, WithSimd};
 
+use crate::ops::Tile;
 use crate::ops::support::put::put;
 use crate::ops::support::sums::{add_sums, sum_of_pairs};
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
@@ -15,8 +16,8 @@ use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, sim
 pub struct LayerNorm {
     /// Added to the variance.
     pub eps: f64,
-    /// Rows handed to a thread at a time; chosen by shape if 0. A gradient check shrinks it to reach tile edges.
-    pub tile: usize,
+    /// Rows handed to a thread at a time.
+    pub tile: Tile,
 }
 
 /// What the backward pass needs: x and the weight; statistics are computed again, from cache.
@@ -76,7 +77,7 @@ fn moments<T: Float>(x: &[T], c: usize, eps: T) -> Vec<[T; 2]> {
 impl LayerNorm {
     /// Rows a tile: about 2^13 elements.
     fn tile(&self, c: usize) -> usize {
-        if self.tile > 0 { self.tile } else { ((1 << 13) / c).max(1) }
+        self.tile.or(((1 << 13) / c).max(1))
     }
 }
 
@@ -180,7 +181,7 @@ impl<T: Float> Op<T> for LayerNorm {
 
 impl Checked for LayerNorm {
     fn cases() -> Vec<Case<Self>> {
-        let op = |tile| LayerNorm { eps: 1e-3, tile };
+        let op = |tile| LayerNorm { eps: 1e-3, tile: Tile::of(tile) };
         let inputs = |rows: &[usize], c: usize| {
             let shape: Vec<usize> = rows.iter().copied().chain([c]).collect();
             [Input::random("x", &shape), Input::random("weight", [c]), Input::random("bias", [c])]
@@ -205,6 +206,6 @@ impl<T: Float> Var<T> {
     /// Normalises each row (the last axis) to mean 0 and variance 1, times `weight` plus `bias`.
     #[track_caller]
     pub fn layer_norm(&self, weight: &Self, bias: &Self, eps: f64) -> Self {
-        apply1(LayerNorm { eps, tile: 0 }, &[self, weight, bias])
+        apply1(LayerNorm { eps, tile: Tile::AUTO }, &[self, weight, bias])
     }
 }

@@ -1,5 +1,6 @@
 //! The linear layer: one product over all the rows of the batch.
 
+use crate::ops::Tile;
 use crate::ops::elementwise::unary::{Function, Gelu};
 use crate::ops::support::epilogue::{Activation, Finish};
 use crate::ops::support::put::put;
@@ -17,8 +18,8 @@ pub struct Linear {
     /// Whether x passes through GELU on its way: `y = gelu(x) w + b`, as in the second half of a transformer's MLP.
     /// gelu(x), the widest tensor of a block, is then computed tile by tile and again for the gradient, never kept.
     pub gelu: bool,
-    /// Rows handed to a thread at a time; chosen by shape if 0. A gradient check shrinks it to reach tile edges.
-    pub tile: usize,
+    /// Rows handed to a thread at a time.
+    pub tile: Tile,
 }
 
 /// `to = gelu(from)`.
@@ -39,7 +40,7 @@ fn apply_gelu<T: Float>(x: &Tensor<T>) -> Tensor<T> {
 }
 
 /// `out = gelu(x) w`, finished; x has rows of k.
-fn forward_of_gelu<T: Float>(out: &mut [T], x: Rows<T>, w: &[T], finish: &Finish<T>, tile: usize) {
+fn forward_of_gelu<T: Float>(out: &mut [T], x: Rows<T>, w: &[T], finish: &Finish<T>, tile: Tile) {
     let k = x.cols;
     let n = out.len() / x.rows.max(1);
     let tile = tile_rows(tile, k, n);
@@ -55,7 +56,7 @@ fn forward_of_gelu<T: Float>(out: &mut [T], x: Rows<T>, w: &[T], finish: &Finish
 }
 
 /// `dx = dy w^T gelu'(x)`.
-fn input_gradient_of_gelu<T: Float>(out: &mut [T], accum: Accum, x: &[T], dy: Rows<T>, w: &[T], tile: usize) {
+fn input_gradient_of_gelu<T: Float>(out: &mut [T], accum: Accum, x: &[T], dy: Rows<T>, w: &[T], tile: Tile) {
     let n = dy.cols;
     let k = out.len() / dy.rows.max(1);
     let tile = tile_rows(tile, k, n);
@@ -141,8 +142,8 @@ impl Checked for Linear {
         let x = |shape: &[usize]| Input::random("x", shape);
         let w = |k: usize, n: usize| Input::random("w", [k, n]);
         let b = |n: usize| Input::random("b", [n]);
-        let tiled = |tile| Linear { tile, gelu: false };
-        let gelu = |tile| Linear { tile, gelu: true };
+        let tiled = |tile| Linear { tile: Tile::of(tile), gelu: false };
+        let gelu = |tile| Linear { tile: Tile::of(tile), gelu: true };
         vec![
             Case::new("with bias", tiled(0), [x(&[2, 3, 5]), w(5, 4), b(4)]),
             Case::new("without bias", tiled(0), [x(&[2, 3, 5]), w(5, 4)]),
@@ -178,7 +179,7 @@ impl<T: Float> Var<T> {
     /// `gelu(x) [.., in] w [in, out] (+ b [out])`, without ever holding the whole of gelu(x).
     #[track_caller]
     pub fn gelu_linear(&self, weight: &Self, bias: Option<&Self>) -> Self {
-        let op = Linear { gelu: true, tile: 0 };
+        let op = Linear { gelu: true, tile: Tile::AUTO };
         match bias {
             Some(bias) => apply1(op, &[self, weight, bias]),
             None => apply1(op, &[self, weight]),

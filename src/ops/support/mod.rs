@@ -7,3 +7,4 @@ pub(in crate::ops) mod put;
 pub(in crate::ops) mod row_products;
 pub(in crate::ops) mod squares;
 pub(in crate::ops) mod sums;
+pub(in crate::ops) mod tile;

@@ -4,6 +4,7 @@
 use super::epilogue::Finish;
 use super::put::begin_sum;
 use super::sums::sum_into;
+use crate::ops::Tile;
 use crate::tensor::gemm::Rows;
 use crate::tensor::register_tile::{Gram, Line, Panels, Product};
 use crate::tensor::{Accum, Float, Tensor, parallel};
@@ -14,12 +15,12 @@ pub(in crate::ops) fn rows_of<T: Float>(x: &Tensor<T>) -> Rows<'_, T> {
 }
 
 /// Rows a tile: about 2^17 multiplications, at least 40 rows; or `tile`, if that is given.
-pub(in crate::ops) fn tile_rows(tile: usize, k: usize, n: usize) -> usize {
-    if tile > 0 { tile } else { ((1 << 17) / (k * n).max(1)).clamp(40, 1000).next_multiple_of(20) }
+pub(in crate::ops) fn tile_rows(tile: Tile, k: usize, n: usize) -> usize {
+    tile.or(((1 << 17) / (k * n).max(1)).clamp(40, 1000).next_multiple_of(20))
 }
 
 /// `out = x w`, finished; x may come in parts, whose columns stand side by side.
-pub(in crate::ops) fn forward<T: Float>(out: &mut [T], parts: &[Rows<T>], w: &[T], finish: &Finish<T>, tile: usize) {
+pub(in crate::ops) fn forward<T: Float>(out: &mut [T], parts: &[Rows<T>], w: &[T], finish: &Finish<T>, tile: Tile) {
     let k = parts.iter().map(|x| x.cols).sum();
     let n = out.len() / parts[0].rows.max(1);
     let tile = tile_rows(tile, k, n);
@@ -34,7 +35,7 @@ pub(in crate::ops) fn forward<T: Float>(out: &mut [T], parts: &[Rows<T>], w: &[T
 }
 
 /// `dx = dy w^T`.
-pub(in crate::ops) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, dy: Rows<T>, w: &[T], tile: usize) {
+pub(in crate::ops) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, dy: Rows<T>, w: &[T], tile: Tile) {
     let n = dy.cols;
     let k = out.len() / dy.rows.max(1);
     let tile = tile_rows(tile, k, n);

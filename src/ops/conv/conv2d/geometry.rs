@@ -2,6 +2,7 @@
 
 use super::Conv2d;
 use crate::ops::ShapeError;
+use crate::ops::Tile;
 use crate::tensor::Shape;
 
 /// What a window sees beyond the edge of the image.
@@ -42,7 +43,7 @@ pub struct Geometry {
     pub(in crate::ops) dilation: [usize; 2],
     pub(in crate::ops) groups: usize,
     pub(in crate::ops) beyond: Beyond,
-    pub(in crate::ops) tile: usize,
+    pub(in crate::ops) tile: Tile,
 }
 
 impl Geometry {
@@ -154,16 +155,13 @@ impl Geometry {
     /// Output rows a tile, at least four tiles where there are four rows: an im2col matrix of some 256 KiB; or half of
     /// that in rows of the image, or of the output.
     pub(in crate::ops) fn tile(&self) -> usize {
-        if self.tile > 0 {
-            return self.tile;
-        }
         let fitting = if self.is_direct() {
             let pixel = (self.channels * self.stride[0] * self.stride[1]).max(self.out_channels);
             (1 << 15) / (pixel * self.out[1]).max(1)
         } else {
             (1 << 16) / (self.patch() * self.out[1]).max(1)
         };
-        fitting.clamp(1, self.rows().div_ceil(4).max(1))
+        self.tile.or(fitting.clamp(1, self.rows().div_ceil(4).max(1)))
     }
 
     /// How many neighbouring outputs of a row are best computed as one pixel with as many times the channels; 1 if each

@@ -10,6 +10,7 @@ pub(in crate::ops) mod geometry;
 pub(in crate::ops) mod kernel;
 pub(in crate::ops) mod parts;
 
+use crate::ops::Tile;
 use crate::ops::support::epilogue::{Activation, paths};
 use crate::ops::support::row_products::{self, rows_of};
 use crate::ops::support::sums::bias_gradient;
@@ -40,8 +41,8 @@ pub struct Conv2d {
     pub parts: usize,
     /// Whether the padding mirrors the image (without repeating its edge) instead of being zero.
     pub reflect: bool,
-    /// Output rows handed to a thread at a time; chosen by shape if 0. A gradient check shrinks it.
-    pub tile: usize,
+    /// Output rows handed to a thread at a time, chosen by the shapes by default.
+    pub tile: Tile,
     /// What follows, applied to a tile while it is in the cache.
     pub activation: Activation,
 }
@@ -55,7 +56,7 @@ impl Default for Conv2d {
             groups: 1,
             parts: 1,
             reflect: false,
-            tile: 0,
+            tile: Tile::AUTO,
             activation: Activation::None,
         }
     }
@@ -154,7 +155,7 @@ impl<T: Float> Op<T> for Conv2d {
             Tensor::build([g.batch, g.out[0], g.out[1], g.out_channels], |out| match g.path() {
                 Path::Pointwise => {
                     let rows: Vec<Rows<T>> = xs.iter().map(|x| rows_of(x)).collect();
-                    row_products::forward(out, &rows, w.data(), finish, 0);
+                    row_products::forward(out, &rows, w.data(), finish, Tile::AUTO);
                 }
                 _ => kernel::convolve(out, Accum::Replace, &g, &parts_of(xs.iter().copied()), w.data(), finish),
             })
@@ -188,7 +189,7 @@ impl<T: Float> Op<T> for Conv2d {
                         &some
                     };
                     match g.path() {
-                        Path::Pointwise => row_products::input_gradient(out, accum, rows_of(&dy), w, 0),
+                        Path::Pointwise => row_products::input_gradient(out, accum, rows_of(&dy), w, Tile::AUTO),
                         _ => kernel::input_gradient(out, accum, &part, dy.data(), w),
                     }
                 });
@@ -293,20 +294,20 @@ impl Checked for Conv2d {
                 [1, 1, 2, 3],
                 true,
             ),
-            case("tile less one", Conv2d { tile: 4, ..same }, [1, 3, 3, 2], [3, 3, 2, 2], false),
-            case("a whole tile", Conv2d { tile: 4, ..same }, [1, 4, 3, 2], [3, 3, 2, 2], false),
-            case("tile and one", Conv2d { tile: 4, ..same }, [1, 5, 3, 2], [3, 3, 2, 2], false),
-            case("a tile across images", Conv2d { tile: 2, ..same }, [2, 3, 3, 2], [3, 3, 2, 2], false),
+            case("tile less one", Conv2d { tile: Tile::of(4), ..same }, [1, 3, 3, 2], [3, 3, 2, 2], false),
+            case("a whole tile", Conv2d { tile: Tile::of(4), ..same }, [1, 4, 3, 2], [3, 3, 2, 2], false),
+            case("tile and one", Conv2d { tile: Tile::of(4), ..same }, [1, 5, 3, 2], [3, 3, 2, 2], false),
+            case("a tile across images", Conv2d { tile: Tile::of(2), ..same }, [2, 3, 3, 2], [3, 3, 2, 2], false),
             case(
                 "tiles of a strided convolution",
-                Conv2d { tile: 2, ..same.strided(2) },
+                Conv2d { tile: Tile::of(2), ..same.strided(2) },
                 [2, 5, 4, 2],
                 [3, 3, 2, 2],
                 false,
             ),
             case(
                 "tiles of a reflected one",
-                Conv2d { tile: 2, ..same.reflecting() },
+                Conv2d { tile: Tile::of(2), ..same.reflecting() },
                 [2, 3, 4, 2],
                 [3, 3, 2, 2],
                 false,
@@ -318,7 +319,7 @@ impl Checked for Conv2d {
             case("side by side, 7x7, stride 2", Conv2d::padded(3).strided(2), [1, 5, 8, 2], [7, 7, 2, 4], false),
             case("side by side, unpadded", Conv2d::default(), [2, 3, 6, 2], [3, 3, 2, 3], true),
             case("side by side, reflected", same.reflecting(), [2, 3, 8, 2], [3, 3, 2, 3], true),
-            case("side by side, tile and one", Conv2d { tile: 4, ..same }, [1, 5, 4, 2], [3, 3, 2, 2], false),
+            case("side by side, tile and one", Conv2d { tile: Tile::of(4), ..same }, [1, 5, 4, 2], [3, 3, 2, 2], false),
             case("many channels", same, [1, 3, 5, 1], [3, 3, 1, 70], false),
             case("several register tiles", same, [1, 2, 15, 4], [3, 3, 4, 17], true),
             case("register tiles of few rows and many columns", same, [1, 2, 11, 4], [3, 3, 4, 16], false),
@@ -332,7 +333,7 @@ impl Checked for Conv2d {
             parts("parts, 1x1, without bias", Conv2d::default(), [5, 6, 10], &[3, 8], [1, 1, 11, 17], false),
             parts("parts, stride 2 of 1x1", Conv2d::default().strided(2), [2, 5, 4], &[1, 2], [1, 1, 3, 2], true),
             parts("parts, side by side", same, [2, 3, 6], &[1, 1], [3, 3, 2, 16], true),
-            parts("parts, tile and one", Conv2d { tile: 4, ..same }, [1, 5, 3], &[1, 2], [3, 3, 3, 2], false),
+            parts("parts, tile and one", Conv2d { tile: Tile::of(4), ..same }, [1, 5, 3], &[1, 2], [3, 3, 3, 2], false),
             parts("parts of an empty batch", same, [0, 4, 5], &[1, 2], [3, 3, 3, 4], true).flat(),
             case("empty batch", same, [0, 4, 5, 3], [3, 3, 3, 4], true).flat(),
         ];
@@ -343,7 +344,7 @@ impl Checked for Conv2d {
                 ("activated, stride 2", same.strided(2), [2, 5, 6, 2], [3, 3, 2, 3]),
                 ("activated, 1x1", Conv2d::default(), [2, 3, 4, 5], [1, 1, 5, 3]),
                 ("activated, groups", Conv2d { groups: 2, ..same }, [2, 3, 4, 4], [3, 3, 2, 6]),
-                ("activated, tile and one", Conv2d { tile: 4, ..same }, [1, 5, 3, 2], [3, 3, 2, 2]),
+                ("activated, tile and one", Conv2d { tile: Tile::of(4), ..same }, [1, 5, 3, 2], [3, 3, 2, 2]),
                 ("activated, side by side", same, [1, 3, 4, 2], [3, 3, 2, 3]),
                 ("activated, reflected, side by side", same.reflecting(), [1, 3, 4, 2], [3, 3, 2, 3]),
                 ("activated, stride 2, side by side", Conv2d::padded(3).strided(2), [1, 4, 8, 1], [7, 7, 1, 3]),

@@ -8,6 +8,7 @@ use std::ops::Range;
 
 use pulp::{Simd, WithSimd};
 
+use crate::ops::Tile;
 use crate::ops::support::sums::sum_into;
 use crate::tensor::gemm::{Rows, RowsMut};
 use crate::tensor::pool::Buffer;
@@ -100,14 +101,14 @@ fn band(row: usize) -> usize {
 /// `y = bias + w * x` (cross-correlation) or `y += ...`: x has `batch * height * width` rows, w `kernel` rows, all with
 /// the same number of columns.
 ///
-/// `tile`: rows of the output handed to a thread at a time, chosen by shape if 0; `done` is called with each of them.
+/// `tile`: rows of the output handed to a thread at a time, `done` is called with each of them.
 pub(crate) fn forward<T: Float>(
     window: &Window,
     x: Rows<T>,
     (w, bias): (&[T], Option<&[T]>),
     y: RowsMut<T>,
     accum: Accum,
-    tile: usize,
+    tile: Tile,
     done: &(dyn Fn(&mut [T]) + Sync),
 ) {
     let ([height, width], c, stride) = (window.out(), x.cols, y.row_stride);
@@ -119,7 +120,7 @@ pub(crate) fn forward<T: Float>(
     }
     let zeros = Buffer::filled(if bias.is_some() { 0 } else { c }, T::ZERO);
     let bias = bias.unwrap_or(&zeros);
-    let tile = if tile > 0 { tile } else { band(width * c * taps) };
+    let tile = tile.or(band(width * c * taps));
     parallel::for_each_chunk(y.data, tile * width * stride, 2 * y.rows * c * taps, |i, out| {
         let pass = Pass { window: *window, height, width, first_row: i * tile, w };
         dispatch_vector(Convolve { pass, x, bias, out: &mut *out, stride, accum });
@@ -326,15 +327,8 @@ impl<T: Float> Line<'_, T> {
 
 /// `dx = ` the gradient of the input, or `dx += ...`: g has a row for each pixel of the output.
 ///
-/// `tile`: rows of the input handed to a thread at a time, chosen by shape if 0.
-pub(crate) fn input_gradient<T: Float>(
-    window: &Window,
-    g: Rows<T>,
-    w: &[T],
-    dx: RowsMut<T>,
-    accum: Accum,
-    tile: usize,
-) {
+/// `tile`: rows of the input handed to a thread at a time.
+pub(crate) fn input_gradient<T: Float>(window: &Window, g: Rows<T>, w: &[T], dx: RowsMut<T>, accum: Accum, tile: Tile) {
     let ([height, width], c, stride) = (window.out(), g.cols, dx.row_stride);
     let [kh, kw] = window.kernel;
     assert!(g.rows == window.batch * height * width && dx.rows == window.pixels(), "depthwise: rows of the images");
@@ -351,7 +345,7 @@ pub(crate) fn input_gradient<T: Float>(
         let window = Window { height, width, padding: kh - 1 - window.padding, ..*window };
         return forward(&window, g, (&turned, None), dx, accum, tile, &|_| ());
     }
-    let tile = if tile > 0 { tile } else { band(window.width * c * kh * kw) };
+    let tile = tile.or(band(window.width * c * kh * kw));
     parallel::for_each_chunk(dx.data, tile * window.width * stride, 2 * g.rows * c * kh * kw, |i, out| {
         let pass = Pass { window: *window, height, width, first_row: i * tile, w };
         dispatch_vector(Gather { pass, g, out, stride, accum });
@@ -485,14 +479,14 @@ impl<T: Float> GatherLine<'_, T> {
 /// `dw = ` the gradient of the weight, or `dw += ...`, in a fixed number of partial sums over bands of rows, added up in
 /// order: the same bits for any number of threads.
 ///
-/// `tile`: rows of the output in a partial sum, chosen by shape if 0.
+/// `tile`: rows of the output in a partial sum.
 pub(crate) fn weight_gradient<T: Float>(
     window: &Window,
     x: Rows<T>,
     g: Rows<T>,
     dw: &mut [T],
     accum: Accum,
-    tile: usize,
+    tile: Tile,
 ) {
     let ([height, width], c) = (window.out(), g.cols);
     let [kh, kw] = window.kernel;
@@ -502,7 +496,7 @@ pub(crate) fn weight_gradient<T: Float>(
         return;
     }
     let rows = window.batch * height;
-    let tile = if tile > 0 { tile } else { rows.div_ceil(16).max(band(width * c * kh * kw) / 4).max(1) };
+    let tile = tile.or(rows.div_ceil(16).max(band(width * c * kh * kw) / 4).max(1));
     let sums = parallel::map(rows.div_ceil(tile), 2 * g.rows * c * kh * kw, |i| {
         Tensor::build([kh * kw, c], |dw| {
             dw.fill(T::ZERO);

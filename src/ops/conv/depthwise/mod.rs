@@ -3,6 +3,7 @@
 pub(crate) mod kernel;
 
 use self::kernel::{Path, Window};
+use crate::ops::Tile;
 use crate::ops::support::epilogue::{Activation, paths};
 use crate::ops::support::sums::bias_gradient;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
@@ -17,8 +18,8 @@ pub struct DepthwiseConv2d {
     pub stride: usize,
     /// Rows and columns of zeros on each side.
     pub padding: usize,
-    /// Rows handed to a thread at a time; chosen by shape if 0. A gradient check shrinks it to reach tile edges.
-    pub tile: usize,
+    /// Rows handed to a thread at a time.
+    pub tile: Tile,
     /// What follows, applied to rows while they are in the cache.
     pub activation: Activation,
 }
@@ -116,7 +117,7 @@ impl Checked for DepthwiseConv2d {
         let w = |kh: usize, kw: usize, c: usize| Input::random("w", [kh, kw, c]);
         let b = |c: usize| Input::random("b", [c]);
         let op = |stride, padding| DepthwiseConv2d { stride, padding, ..DepthwiseConv2d::default() };
-        let tiled = |tile| DepthwiseConv2d { tile, ..op(1, 1) };
+        let tiled = |tile| DepthwiseConv2d { tile: Tile::of(tile), ..op(1, 1) };
         let mut cases = vec![
             Case::new("3x3, a whole block", op(1, 1), [x(&[2, 2, 7, 16]), w(3, 3, 16), b(16)]),
             Case::new("3x3, overlapping blocks", op(1, 1), [x(&[2, 2, 6, 18]), w(3, 3, 18)]),
@@ -141,7 +142,11 @@ impl Checked for DepthwiseConv2d {
             Case::new("tile less one", tiled(4), [x(&[1, 3, 5, 8]), w(3, 3, 8)]),
             Case::new("a whole tile", tiled(4), [x(&[2, 2, 5, 8]), w(3, 3, 8)]),
             Case::new("tile and one", tiled(4), [x(&[1, 5, 5, 8]), w(3, 3, 8)]),
-            Case::new("tiles by 2", DepthwiseConv2d { tile: 2, ..op(2, 1) }, [x(&[2, 5, 4, 8]), w(3, 3, 8), b(8)]),
+            Case::new(
+                "tiles by 2",
+                DepthwiseConv2d { tile: Tile::of(2), ..op(2, 1) },
+                [x(&[2, 5, 4, 8]), w(3, 3, 8), b(8)],
+            ),
             Case::new("no image", op(1, 1), [x(&[0, 3, 3, 8]), w(3, 3, 8), b(8)]).flat(),
         ];
         for activation in [Activation::Relu, Activation::Hardswish, Activation::Elu] {
@@ -246,18 +251,18 @@ mod tests {
             let g_part = Rows::columns(g.data(), out_rows, wide, first, c);
             let mut out = Tensor::full([out_rows, wide], 0.5);
             let to = RowsMut::columns(out.data_mut(), out_rows, wide, first, c);
-            kernel::forward(&window, x_part, (w.data(), None), to, Accum::Replace, 0, &|_| ());
+            kernel::forward(&window, x_part, (w.data(), None), to, Accum::Replace, Tile::AUTO, &|_| ());
             assert!(columns(&out).reshape(*y.shape()).same_bits(y.value()));
             assert_eq!(out.data().iter().filter(|&&v| v == 0.5).count(), out_rows * (wide - c));
 
             let mut dx = Tensor::full([rows, wide], 0.5);
             let to = RowsMut::columns(dx.data_mut(), rows, wide, first, c);
-            kernel::input_gradient(&window, g_part, w.data(), to, Accum::Replace, 0);
+            kernel::input_gradient(&window, g_part, w.data(), to, Accum::Replace, Tile::AUTO);
             assert!(columns(&dx).reshape([2, 5, 7, c]).same_bits(&gradients.take(&xv).unwrap()));
             assert_eq!(dx.data().iter().filter(|&&v| v == 0.5).count(), rows * (wide - c));
 
             let mut dw = Tensor::zeros([3, 3, c]);
-            kernel::weight_gradient(&window, x_part, g_part, dw.data_mut(), Accum::Replace, 0);
+            kernel::weight_gradient(&window, x_part, g_part, dw.data_mut(), Accum::Replace, Tile::AUTO);
             assert!(dw.same_bits(&gradients.take(&wv).unwrap()));
         }
     }

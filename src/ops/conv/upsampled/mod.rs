@@ -10,6 +10,7 @@ mod squares;
 
 use super::conv2d::geometry::{Beyond, Geometry};
 use super::conv2d::{Conv2d, kernel, parts_of};
+use crate::ops::Tile;
 use crate::ops::support::epilogue::{Activation, Finish, paths};
 use crate::ops::support::put::put_run;
 use crate::ops::support::row_products::{self, rows_of};
@@ -26,8 +27,8 @@ use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 pub struct UpsampledConv2d {
     /// How many images stand beside the small one: n.
     pub parts: usize,
-    /// Rows of x0 handed to a thread at a time; chosen by shape if 0. A gradient check shrinks it.
-    pub tile: usize,
+    /// Rows of x0 handed to a thread at a time, chosen by the shapes by default.
+    pub tile: Tile,
     /// What follows.
     pub activation: Activation,
 }
@@ -98,7 +99,7 @@ impl UpsampledConv2d {
             dilation: [1; 2],
             groups: 1,
             beyond: Beyond::Mirrored,
-            tile: 2 * self.tile,
+            tile: self.tile.times(2),
         };
         let (size, tile) = ([h, wd], self.tile);
         Ok(Both { small: Geometry { size, out: size, channels, beyond: Beyond::Nearest, tile, ..full }, full })
@@ -148,7 +149,7 @@ impl<T: Float> Op<T> for UpsampledConv2d {
                     match g.path() {
                         Path::Pointwise => {
                             let rows: Vec<Rows<T>> = xs[1..].iter().map(|x| rows_of(x)).collect();
-                            row_products::forward(out, &rows, &of_full, &Finish::nothing(), 0);
+                            row_products::forward(out, &rows, &of_full, &Finish::nothing(), Tile::AUTO);
                         }
                         Path::Squares => {
                             let parts = parts_of(xs[1..].iter().copied());
@@ -181,7 +182,7 @@ impl<T: Float> Op<T> for UpsampledConv2d {
             sink.accumulate(0, |out, accum| {
                 let w = kernel::weights_of(&g.small, 0, g.channels(), w.data());
                 match &sums {
-                    Some(sums) => row_products::input_gradient(out, accum, rows_of(sums), &w, 0),
+                    Some(sums) => row_products::input_gradient(out, accum, rows_of(sums), &w, Tile::AUTO),
                     None => squares::input_gradient(out, accum, &g.small, dy.data(), &w),
                 }
             });
@@ -191,7 +192,7 @@ impl<T: Float> Op<T> for UpsampledConv2d {
                 sink.accumulate(i + 1, |out, accum| {
                     let w = kernel::weights_of(&part, first, g.channels(), w.data());
                     match g.path() {
-                        Path::Pointwise => row_products::input_gradient(out, accum, rows_of(&dy), &w, 0),
+                        Path::Pointwise => row_products::input_gradient(out, accum, rows_of(&dy), &w, Tile::AUTO),
                         Path::Squares => kernel::input_gradient(out, accum, &part, dy.data(), &w),
                     }
                 });
@@ -274,8 +275,22 @@ impl Checked for UpsampledConv2d {
             case("3x3, no channel of it", plain, [1, 2, 2, 0], &[2], [3, 3], false),
             case("3x3, several register tiles", plain, [1, 1, 13, 2], &[2], [3, 17], true),
             case("3x3, whole vectors", plain, [1, 2, 3, 8], &[], [3, 16], false),
-            case("3x3, tile and one", UpsampledConv2d { tile: 2, ..plain }, [1, 3, 2, 2], &[1], [3, 2], false),
-            case("3x3, a tile across images", UpsampledConv2d { tile: 2, ..plain }, [2, 3, 1, 2], &[], [3, 2], true),
+            case(
+                "3x3, tile and one",
+                UpsampledConv2d { tile: Tile::of(2), ..plain },
+                [1, 3, 2, 2],
+                &[1],
+                [3, 2],
+                false,
+            ),
+            case(
+                "3x3, a tile across images",
+                UpsampledConv2d { tile: Tile::of(2), ..plain },
+                [2, 3, 1, 2],
+                &[],
+                [3, 2],
+                true,
+            ),
             case("3x3 of an empty batch", plain, [0, 2, 3, 2], &[1], [3, 2], true).flat(),
             case("1x1", plain, [2, 2, 3, 3], &[2], [1, 4], true),
             case("1x1 without bias", plain, [1, 3, 2, 2], &[1, 0, 3], [1, 17], false),
@@ -305,7 +320,7 @@ impl<T: Float> Var<T> {
         let kernel = weight.shape().dims()[0];
         let plain = if kernel == 1 { Conv2d::default() } else { Conv2d::padded(1).reflecting() };
         assert_eq!(op, plain.activated(op.activation), "a convolution of an enlarged image keeps its size");
-        let op = UpsampledConv2d { parts: parts.len(), tile: 0, activation: op.activation };
+        let op = UpsampledConv2d { parts: parts.len(), tile: Tile::AUTO, activation: op.activation };
         let inputs: Vec<&Self> = [small].into_iter().chain(parts.iter().copied()).chain([weight]).chain(bias).collect();
         apply1(op, &inputs)
     }

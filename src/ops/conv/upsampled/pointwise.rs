@@ -1,5 +1,6 @@
 //! The 1x1 window: a product of the small image's pixels, whose results fill squares of four.
 
+use crate::ops::Tile;
 use crate::ops::conv::conv2d::geometry::Geometry;
 use crate::ops::support::epilogue::Finish;
 use crate::ops::support::put::put_run;
@@ -10,7 +11,8 @@ use crate::tensor::{Accum, Float, Tensor, parallel, simd};
 /// `out = x w` in squares, or added to what is there; and finished.
 pub(super) fn convolve<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: Rows<T>, w: &[T], finish: &Finish<T>) {
     let n = g.out_channels;
-    let products = Tensor::build([x.rows, n], |out| row_products::forward(out, &[x], w, &Finish::nothing(), 0));
+    let products =
+        Tensor::build([x.rows, n], |out| row_products::forward(out, &[x], w, &Finish::nothing(), Tile::AUTO));
     let line = g.out[1] * n;
     let work = 2 * out.len();
     if work == 0 {
