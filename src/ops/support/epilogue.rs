@@ -92,6 +92,11 @@ impl Function for Identity {
 }
 
 impl Activation {
+    /// All but none.
+    pub(in crate::ops) fn fused() -> impl Iterator<Item = Activation> {
+        Self::ALL.into_iter().filter(|activation| *activation != Activation::None)
+    }
+
     /// A kernel path's name, of those that [`paths!`](paths) makes.
     pub(in crate::ops) fn among(self, names: [&'static str; COUNT]) -> &'static str {
         names[self as usize]

@@ -337,7 +337,7 @@ impl Checked for Conv2d {
             parts("parts of an empty batch", same, [0, 4, 5], &[1, 2], [3, 3, 3, 4], true).flat(),
             case("empty batch", same, [0, 4, 5, 3], [3, 3, 3, 4], true).flat(),
         ];
-        for activation in [Activation::Relu, Activation::Hardswish, Activation::Elu] {
+        for activation in Activation::fused() {
             let paths = [
                 ("activated", same, [2, 4, 5, 3], [3, 3, 3, 4]),
                 ("activated, reflected", same.reflecting(), [2, 3, 5, 2], [3, 3, 2, 3]),

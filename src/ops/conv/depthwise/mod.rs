@@ -149,7 +149,7 @@ impl Checked for DepthwiseConv2d {
             ),
             Case::new("no image", op(1, 1), [x(&[0, 3, 3, 8]), w(3, 3, 8), b(8)]).flat(),
         ];
-        for activation in [Activation::Relu, Activation::Hardswish, Activation::Elu] {
+        for activation in Activation::fused() {
             let activated = |op| DepthwiseConv2d { activation, ..op };
             cases.extend([
                 Case::new("3x3, activated", activated(op(1, 1)), [x(&[2, 2, 7, 16]), w(3, 3, 16), b(16)]),

@@ -298,7 +298,7 @@ impl Checked for UpsampledConv2d {
             case("1x1 alone", plain, [2, 2, 2, 3], &[], [1, 2], true),
             case("1x1 of an empty batch", plain, [0, 2, 3, 2], &[1], [1, 2], true).flat(),
         ];
-        for activation in [Activation::Relu, Activation::Hardswish, Activation::Elu] {
+        for activation in Activation::fused() {
             let op = UpsampledConv2d { activation, ..plain };
             cases.push(case("3x3, activated", op, [1, 2, 2, 2], &[], [3, 3], true));
             cases.push(case("3x3 beside another, activated", op, [1, 2, 3, 1], &[2], [3, 3], true));
