@@ -11,7 +11,7 @@ use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
 use super::Dataset;
-use super::augment::{Jitter, flip, flip_intrinsics};
+use super::augment::{Jitter, flip};
 use super::resize::lanczos;
 use crate::camera::Intrinsics;
 use crate::error::{Error, Result};
@@ -122,16 +122,13 @@ pub fn batch_of_step(data: &dyn Dataset, augment: Augment, batch: usize, seed: u
     for sample in samples {
         let (mirrored, jitter) = (random.coin() && augment.flip, Jitter::draw(random.chacha()));
         let jitter = jitter.filter(|_| augment.jitter);
-        let mut camera = data.intrinsics(sample);
         let mut plain = Vec::new();
         for offset in [-1, 0, 1] {
             let image = data.image(sample, offset)?;
             plain.push(if mirrored { Arc::new(flip(&image)) } else { image });
         }
         let (w, h) = plain[1].dimensions();
-        if mirrored {
-            camera = flip_intrinsics(camera, w as usize);
-        }
+        let camera = if mirrored { data.mirrored_intrinsics(sample, w as usize) } else { data.intrinsics(sample) };
         intrinsics.push(in_pixels(camera, w as usize, h as usize));
         let mut pyramid = vec![plain[1].clone()];
         for s in 1..SCALES {
@@ -214,6 +211,7 @@ impl Drop for Loader {
 mod tests {
     use super::*;
     use crate::street::{Street, StreetConfig};
+    use crate::tensor::Var;
 
     #[test]
     fn smaller_sources_are_made_like_the_pyramid_of_the_target() {
@@ -228,6 +226,57 @@ mod tests {
             assert!(next.same_bits(&batch.pyramid[scale + 1]), "scale {}", scale + 1);
             assert!(!previous.same_bits(next));
         }
+    }
+
+    /// The mean difference between a batch's targets and its next frames, warped by true depths and poses, sample by
+    /// sample.
+    fn warped_with_the_truth(street: &Street, batch: &Batch, samples: &[usize], mirrored: &[bool]) -> Vec<f64> {
+        let (height, width) = (street.config().height, street.config().width);
+        let (mut depths, mut poses) = (Vec::new(), Vec::new());
+        for (&sample, &mirrored) in samples.iter().zip(mirrored) {
+            let depth = street.depth(sample).unwrap().unwrap();
+            let metres: Vec<f32> = depth.metres.iter().map(|&m| if m > 0.0 { m } else { 500.0 }).collect();
+            depths.extend(if mirrored { crate::eval::metrics::mirror(&metres, width) } else { metres });
+            // With x the other way round on both sides.
+            let sign = |axis: usize| if mirrored && axis == 0 { -1.0 } else { 1.0 };
+            for (i, row) in street.relative_pose(sample, 1).iter().enumerate() {
+                poses.extend((0..4).map(|j| (row[j] * sign(i) * sign(j)) as f32));
+            }
+        }
+        let tensor =
+            |shape: &[usize], values: &[f32]| Var::constant(Tensor::build(shape, |out| out.copy_from_slice(values)));
+        let depth = tensor(&[samples.len(), height, width, 1], &depths);
+        let pose = tensor(&[samples.len(), 3, 4], &poses);
+        let warped = Var::constant(batch.sources[1].clone()).warp(&depth, &pose, &batch.intrinsics, true);
+        let each = 3 * height * width;
+        let pairs = warped.value().data().chunks(each).zip(batch.pyramid[0].data().chunks(each));
+        let sum = |(a, b): (&[f32], &[f32])| a.iter().zip(b).map(|(a, b)| f64::from((a - b).abs())).sum::<f64>();
+        pairs.map(|pair| sum(pair) / each as f64).collect()
+    }
+
+    #[test]
+    fn a_mirrored_street_warps_as_well_as_the_street() {
+        let street = Street::render(&StreetConfig { sequences: 2, frames: 6, ..StreetConfig::default() }, None);
+        let samples = samples_of_step(street.len(), 4, 0, 0);
+        let of = |flip: bool| batch_of_step(&street, Augment { flip, jitter: false }, 4, 0, 0).unwrap();
+        let (plain, mixed) = (of(false), of(true));
+        let each = 3 * 96 * 320;
+        let parts = plain.pyramid[0].data().chunks(each).zip(mixed.pyramid[0].data().chunks(each));
+        let mirrored: Vec<bool> = parts.map(|(a, b)| a != b).collect();
+        assert!(mirrored.contains(&true) && mirrored.contains(&false), "{mirrored:?}");
+        let found = warped_with_the_truth(&street, &plain, &samples, &[false; 4]);
+        let again = warped_with_the_truth(&street, &mixed, &samples, &mirrored);
+        for (a, b) in found.iter().zip(&again) {
+            assert!((a / b - 1.0).abs() < 1e-4, "{found:?} {again:?}");
+        }
+        // A pixel beside the true principal point is seen: the comparison above is worth something.
+        let mut beside = mixed;
+        for (k, &mirrored) in beside.intrinsics.iter_mut().zip(&mirrored) {
+            assert_eq!(k[2], if mirrored { 159.0 } else { 160.0 });
+            k[2] = 160.0;
+        }
+        let beside = warped_with_the_truth(&street, &beside, &samples, &mirrored);
+        assert!(beside.iter().zip(&again).zip(&mirrored).all(|((a, b), &m)| (a != b) == m), "{beside:?} {again:?}");
     }
 
     #[test]

@@ -34,6 +34,12 @@ pub trait Dataset: Send + Sync {
     /// The camera of a sample.
     fn intrinsics(&self, sample: usize) -> Intrinsics;
 
+    /// The camera of a sample's pictures once they are mirrored and `width` pixels wide: its principal point is mirrored
+    /// with them.
+    fn mirrored_intrinsics(&self, sample: usize, width: usize) -> Intrinsics {
+        augment::flip_intrinsics(self.intrinsics(sample), width)
+    }
+
     /// The cameras of all samples in words, each once: intrinsics, and where they were found.
     fn cameras(&self) -> Vec<String> {
         Vec::new()
@@ -68,6 +74,9 @@ impl Dataset for Subset {
     }
     fn intrinsics(&self, sample: usize) -> Intrinsics {
         self.data.intrinsics(self.samples[sample])
+    }
+    fn mirrored_intrinsics(&self, sample: usize, width: usize) -> Intrinsics {
+        self.data.mirrored_intrinsics(self.samples[sample], width)
     }
     fn cameras(&self) -> Vec<String> {
         self.data.cameras()

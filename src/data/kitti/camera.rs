@@ -18,7 +18,8 @@ pub enum Camera {
     /// `calib_cam_to_cam.txt`, and, for pictures of KITTI's aspect alone, the published constants.
     #[default]
     Auto,
-    /// The constants of the published training, whatever the drive: [`Intrinsics::KITTI`].
+    /// The constants of the published training, whatever the drive: [`Intrinsics::KITTI`]. As there they hold for mirrored
+    /// pictures, too: their centre is a convention, not a measurement.
     KittiPublished,
     /// `P_rect_02` or `P_rect_03` of the day's `calib_cam_to_cam.txt`, over `S_rect`.
     Calibrated,
@@ -38,6 +39,26 @@ pub enum Camera {
         /// Vertical principal point.
         cy: f64,
     },
+}
+
+/// A camera that was found.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Found {
+    pub(super) intrinsics: Intrinsics,
+    /// Where it was found, in words.
+    pub(super) place: String,
+    /// Whether these are the published constants, and not what somebody measured.
+    pub(super) published: bool,
+}
+
+impl Found {
+    fn measured(intrinsics: Intrinsics, place: impl Into<String>) -> Found {
+        Found { intrinsics, place: place.into(), published: false }
+    }
+
+    fn published(place: impl Into<String>) -> Found {
+        Found { intrinsics: Intrinsics::KITTI, place: place.into(), published: true }
+    }
 }
 
 /// Width over height of KITTI's pictures.
@@ -65,36 +86,30 @@ impl Camera {
     ///
     /// # Errors
     /// If nothing is known of the camera, or what is said cannot be.
-    pub(super) fn resolve(
-        self,
-        root: &Path,
-        drive: &Path,
-        side: Side,
-        (width, height): (u32, u32),
-    ) -> Result<(Intrinsics, String)> {
+    pub(super) fn resolve(self, root: &Path, drive: &Path, side: Side, (width, height): (u32, u32)) -> Result<Found> {
         let size = [f64::from(width), f64::from(height)];
         let day = drive.parent().unwrap_or(drive);
         match self {
-            Camera::KittiPublished => Ok((Intrinsics::KITTI, "KITTI's published constants".into())),
+            Camera::KittiPublished => Ok(Found::published("KITTI's published constants")),
             Camera::Calibrated => calibrated(day, side),
             Camera::Fov { degrees } => {
                 let found = of_fov(degrees, size).map_err(|why| Error::setting("camera.degrees", why))?;
-                Ok((found, format!("a field of view of {degrees} degrees")))
+                Ok(Found::measured(found, format!("a field of view of {degrees} degrees")))
             }
             Camera::Pixels { fx, fy, cx, cy } => {
                 let found = of_pixels([fx, fy, cx, cy], size).map_err(|why| Error::setting("camera", why))?;
-                Ok((found, "the intrinsics that were given".into()))
+                Ok(Found::measured(found, "the intrinsics that were given"))
             }
             Camera::Auto => {
                 let above = drive.ancestors().take_while(|folder| folder.starts_with(root));
                 if let Some(file) = above.map(|folder| folder.join(FILE)).find(|file| file.is_file()) {
-                    return Ok((read(&file, size)?, file.display().to_string()));
+                    return Ok(Found::measured(read(&file, size)?, file.display().to_string()));
                 }
                 if Calibration::has_cameras(day) {
                     return calibrated(day, side);
                 }
                 if ((size[0] / size[1]) / KITTI_ASPECT - 1.0).abs() < 0.1 {
-                    return Ok((Intrinsics::KITTI, "KITTI's published constants, for want of a calibration".into()));
+                    return Ok(Found::published("KITTI's published constants, for want of a calibration"));
                 }
                 let message = format!(
                     "nothing says which camera took these pictures of {width}x{height}: write {FILE} into this folder or \
@@ -107,9 +122,9 @@ impl Camera {
     }
 }
 
-fn calibrated(day: &Path, side: Side) -> Result<(Intrinsics, String)> {
+fn calibrated(day: &Path, side: Side) -> Result<Found> {
     let found = Calibration::intrinsics_of(day, side)?;
-    Ok((found, day.join(super::calibration::CAMERAS).display().to_string()))
+    Ok(Found::measured(found, day.join(super::calibration::CAMERAS).display().to_string()))
 }
 
 /// Reads `camera.toml`, for pictures of a size.
@@ -166,13 +181,17 @@ mod tests {
 
     /// What a drive's camera is found to be, with a `camera.toml` in the drive's folder.
     fn found(text: Option<&str>, camera: Camera) -> Result<(Intrinsics, String)> {
+        resolved(text, camera, SIZE).map(|found| (found.intrinsics, found.place))
+    }
+
+    fn resolved(text: Option<&str>, camera: Camera, size: (u32, u32)) -> Result<Found> {
         let place = tempfile::tempdir().unwrap();
         let drive = place.path().join("day/drive");
         fs::create_dir_all(&drive).unwrap();
         if let Some(text) = text {
             fs::write(drive.join(FILE), text).unwrap();
         }
-        camera.resolve(place.path(), &drive, Side::Left, SIZE)
+        camera.resolve(place.path(), &drive, Side::Left, size)
     }
 
     #[test]
@@ -195,6 +214,17 @@ mod tests {
         assert_eq!(found(file, Camera::KittiPublished).unwrap().0, Intrinsics::KITTI);
         let error = found(None, Camera::Auto).unwrap_err().to_string();
         assert!(error.contains("drive") && error.contains("800x600") && error.contains("--fov"), "{error}");
+    }
+
+    #[test]
+    fn only_the_published_constants_by_name_count_as_published() {
+        let kitti = (1242, 375);
+        let published = |text, camera| resolved(text, camera, kitti).unwrap().published;
+        assert!(published(None, Camera::Auto) && published(Some("fov = 90"), Camera::KittiPublished));
+        // The same numbers, measured.
+        let [fx, fy, cx, cy] = [0.58 * 1242.0, 1.92 * 375.0, 621.0, 187.5];
+        assert!(!published(None, Camera::Pixels { fx, fy, cx, cy }));
+        assert!(!published(Some("fov = 90"), Camera::Auto) && !published(None, Camera::Fov { degrees: 80.0 }));
     }
 
     #[test]

@@ -28,6 +28,7 @@ pub use lidar::{DepthAxis, project_scan, read_scan};
 pub use split::{Side, SplitLine, read_split};
 
 use super::Dataset;
+use super::augment::flip_intrinsics;
 use super::resize::lanczos;
 use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
@@ -137,8 +138,8 @@ pub struct Kitti {
     height: u32,
     width: u32,
     options: Options,
-    /// Of each drive and side: the intrinsics, and where they were found.
-    cameras: BTreeMap<(usize, Side), (Intrinsics, String)>,
+    /// Of each drive and side.
+    cameras: BTreeMap<(usize, Side), camera::Found>,
     cache: Mutex<Cache>,
 }
 
@@ -330,6 +331,11 @@ impl Kitti {
         })
     }
 
+    fn camera(&self, sample: usize) -> &camera::Found {
+        let frame = self.samples[sample];
+        &self.cameras[&(frame.drive, frame.side)]
+    }
+
     /// Which camera a sample was taken with.
     pub fn side(&self, sample: usize) -> Side {
         self.samples[sample].side
@@ -394,13 +400,18 @@ impl Dataset for Kitti {
     }
 
     fn intrinsics(&self, sample: usize) -> Intrinsics {
-        let frame = self.samples[sample];
-        self.cameras[&(frame.drive, frame.side)].0
+        self.camera(sample).intrinsics
+    }
+
+    /// The published constants stay as they are, as in the published training.
+    fn mirrored_intrinsics(&self, sample: usize, width: usize) -> Intrinsics {
+        let camera = self.camera(sample);
+        if camera.published { camera.intrinsics } else { flip_intrinsics(camera.intrinsics, width) }
     }
 
     fn cameras(&self) -> Vec<String> {
         let mut said: Vec<String> = Vec::new();
-        for (k, place) in self.cameras.values() {
+        for camera::Found { intrinsics: k, place, .. } in self.cameras.values() {
             let line = format!("fx {:.4}, fy {:.4}, cx {:.4}, cy {:.4} of the size: {place}", k.fx, k.fy, k.cx, k.cy);
             if !said.contains(&line) {
                 said.push(line);

@@ -244,6 +244,19 @@ fn without_a_list_the_real_piece_gives_its_triplets() {
 }
 
 #[test]
+fn a_mirrored_picture_has_a_mirrored_camera_but_for_the_published_constants() {
+    let root = made_up(3..7);
+    let pixels = Camera::Pixels { fx: 12.0, fy: 12.0, cx: 6.0, cy: 7.0 };
+    for (camera, cx) in [(pixels, 1.0 - 1.0 / 12.0 - 0.25), (Camera::KittiPublished, 0.5)] {
+        let kitti = open(root.path(), Some("day/drive 5 r"), Options { camera, ..PUBLISHED }).unwrap();
+        let whole = crate::data::Subset::new(Arc::new(kitti), vec![0]);
+        let mirrored = whole.mirrored_intrinsics(0, 12);
+        assert!((mirrored.cx - cx).abs() < 1e-12, "{mirrored:?}");
+        assert_eq!(Intrinsics { cx: whole.intrinsics(0).cx, ..mirrored }, whole.intrinsics(0));
+    }
+}
+
+#[test]
 fn a_measured_camera_needs_no_lidar() {
     let root = made_up(3..7);
     let lines = "S_rect_02: 24 16\nS_rect_03: 24 16\nP_rect_02: 12 0 11 0 0 12 7 0 0 0 1 0\n\
