@@ -3,6 +3,7 @@
 //! | module | format |
 //! |---|---|
 //! | [`atomic`] | how every file is written: aside, then renamed |
+//! | [`bounded`] | how whole files are read: never more than such a file may have |
 //! | [`safetensors`] | named tensors, the crate's own checkpoints |
 //! | [`pth`] | named tensors in PyTorch's pickles, read as data |
 //! | [`npz`], [`npy`] | NumPy's archives and arrays |
@@ -13,6 +14,7 @@
 //! [`TensorFile`] opens any file of named tensors.
 
 pub mod atomic;
+pub mod bounded;
 pub mod depth_png;
 pub mod npy;
 pub mod npz;

@@ -74,6 +74,17 @@ fn check_png(bytes: &[u8]) -> Result<(), Fault> {
     Err(CUT_SHORT)
 }
 
+/// How many bytes [`png_size`] looks at: the signature and the first chunk.
+pub(super) const PNG_HEADER: u64 = 33;
+
+/// Width and height of a PNG by its header, if that is whole.
+pub(super) fn png_size(bytes: &[u8]) -> Option<(u32, u32)> {
+    let chunk = bytes.strip_prefix(b"\x89PNG\r\n\x1a\n\0\0\0\x0d")?;
+    let number = |at: usize| Some(u32::from_be_bytes(*chunk.get(at..)?.first_chunk()?));
+    let header = chunk.get(..17).filter(|header| header.starts_with(b"IHDR"))?;
+    (number(17)? == crc32fast::hash(header)).then_some((number(4)?, number(8)?))
+}
+
 fn check_webp(bytes: &[u8]) -> Result<(), Fault> {
     let number = |at: usize| Some(u32::from_le_bytes(*bytes.get(at..)?.first_chunk()?) as usize);
     let end = number(4).unwrap_or(0).saturating_add(8);

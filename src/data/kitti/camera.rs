@@ -1,6 +1,5 @@
 //! Which camera took the pictures: what the user says, a `camera.toml` among the data, the calibration, or KITTI's constants.
 
-use std::fs;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
@@ -8,6 +7,8 @@ use serde::{Deserialize, Serialize};
 use super::calibration::Calibration;
 use super::split::Side;
 use crate::camera::Intrinsics;
+use crate::formats::bounded::{MAX_SETTINGS, read_text};
+use crate::formats::picture::is_size;
 use crate::{Error, Result};
 
 /// The intrinsics that samples carry.
@@ -129,7 +130,7 @@ fn calibrated(day: &Path, side: Side) -> Result<Found> {
 
 /// Reads `camera.toml`, for pictures of a size.
 fn read(path: &Path, size: [f64; 2]) -> Result<Intrinsics> {
-    let text = fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+    let text = read_text(path, MAX_SETTINGS, "a camera")?;
     let said: CameraFile = toml::from_str(&text).map_err(|e| Error::file(path, e.to_string()))?;
     let found = match said {
         CameraFile { fov: Some(fov), fx: None, fy: None, cx: None, cy: None, .. } => of_fov(fov, size),
@@ -142,7 +143,9 @@ fn read(path: &Path, size: [f64; 2]) -> Result<Intrinsics> {
             cy: Some(cy),
             fov: None,
         } => {
-            if ((w / h) / (size[0] / size[1]) - 1.0).abs() > 0.02 {
+            if !is_size(w, h) {
+                Err(format!("is for pictures of {w}x{h}: expected whole pixels, at most 100 megapixels"))
+            } else if ((w / h) / (size[0] / size[1]) - 1.0).abs() > 0.02 {
                 Err(format!("is for pictures of {w}x{h}, but these have {}x{}: another aspect", size[0], size[1]))
             } else {
                 of_pixels([fx, fy, cx, cy], [w, h])
@@ -175,6 +178,8 @@ fn of_pixels([fx, fy, cx, cy]: [f64; 4], [width, height]: [f64; 2]) -> Result<In
 
 #[cfg(test)]
 mod tests {
+    use std::fs::{self, File};
+
     use super::*;
 
     const SIZE: (u32, u32) = (800, 600);
@@ -217,6 +222,15 @@ mod tests {
     }
 
     #[test]
+    fn a_camera_file_that_is_too_long_is_not_read() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join(FILE);
+        File::create(&path).unwrap().set_len(1 << 40).unwrap();
+        let error = read(&path, [800.0, 600.0]).unwrap_err().to_string();
+        assert!(error.contains(FILE) && error.contains("a camera of more than 1048576"), "{error}");
+    }
+
+    #[test]
     fn only_the_published_constants_by_name_count_as_published() {
         let kitti = (1242, 375);
         let published = |text, camera| resolved(text, camera, kitti).unwrap().published;
@@ -241,6 +255,10 @@ mod tests {
             "width = 800\nheight = 600\nfx = 500\nfy = 500\ncx = 900\ncy = 300",
             "width = 800\nheight = 300\nfx = 500\nfy = 500\ncx = 400\ncy = 200",
             "focal = 3",
+            // Sizes that no picture has.
+            "width = 1e9\nheight = 7.5e8\nfx = 500\nfy = 500\ncx = 400\ncy = 300",
+            "width = 800.5\nheight = 600.375\nfx = 500\nfy = 500\ncx = 400\ncy = 300",
+            "width = nan\nheight = nan\nfx = 500\nfy = 500\ncx = 400\ncy = 300",
         ] {
             let error = found(Some(text), Camera::Auto).unwrap_err().to_string();
             assert!(error.contains(FILE), "{text}: {error}");

@@ -1,8 +1,8 @@
 //! Split lists: which frames belong to a part of the data.
 
-use std::fs;
 use std::path::{Component, Path};
 
+use crate::formats::bounded::read_text;
 use crate::{Error, Result};
 
 /// Which of the two colour cameras.
@@ -40,6 +40,9 @@ impl Side {
     }
 }
 
+/// A list of a million frames has fewer bytes.
+const MAX_LIST: u64 = 64 << 20;
+
 /// A line of a split list.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SplitLine {
@@ -59,7 +62,7 @@ pub struct SplitLine {
 /// # Errors
 /// For the first line that is something else, with the file and the number of the line.
 pub fn read_split(path: &Path) -> Result<Vec<SplitLine>> {
-    let text = fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+    let text = read_text(path, MAX_LIST, "a split list")?;
     let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
     let lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
     lines
@@ -94,6 +97,8 @@ fn parse(number: usize, line: &str) -> Result<SplitLine, String> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs::{self, File};
+
     use super::*;
 
     fn read(text: &str) -> Result<Vec<SplitLine>> {
@@ -126,6 +131,15 @@ mod tests {
             let error = read(text).unwrap_err().to_string();
             assert!(error.contains("split.txt: line 3: ") && error.contains(what), "{error}");
         }
+    }
+
+    #[test]
+    fn a_list_that_is_too_long_is_not_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("split.txt");
+        File::create(&path).unwrap().set_len(1 << 40).unwrap();
+        let error = read_split(&path).unwrap_err().to_string();
+        assert!(error.contains("split.txt") && error.contains("a split list of more than 67108864"), "{error}");
     }
 
     #[test]
