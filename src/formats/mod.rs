@@ -16,6 +16,7 @@
 pub mod atomic;
 pub mod bounded;
 pub mod depth_png;
+mod jpeg_scans;
 pub mod npy;
 pub mod npz;
 pub mod picture;
