@@ -48,7 +48,7 @@ const MAX_LIST: u64 = 64 << 20;
 pub struct SplitLine {
     /// The number of the line, from 1.
     pub number: usize,
-    /// The drive, `DATE/DRIVE`.
+    /// The drive, `DATE/DRIVE`, however it is spelled: `./DATE//DRIVE/` is the same.
     pub folder: String,
     /// The target frame.
     pub frame: u32,
@@ -80,9 +80,7 @@ fn parse(number: usize, line: &str) -> Result<SplitLine, String> {
     let &[folder, frame, side] = fields.as_slice() else {
         return Err(format!("found {} fields", fields.len()));
     };
-    if !Path::new(folder).components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir)) {
-        return Err("with a folder inside the data set's".to_owned());
-    }
+    let folder = spelled(folder).ok_or_else(|| "with a folder inside the data set's".to_owned())?;
     // Ten digits are the most a file name has.
     let frame = frame.parse().map_err(|_| format!("with a frame number like 5 or 0000000005, found {frame:?}"))?;
     let side = match side {
@@ -92,7 +90,20 @@ fn parse(number: usize, line: &str) -> Result<SplitLine, String> {
             return Err(format!("with the side l (image_02) or r (image_03), found {side:?}"));
         }
     };
-    Ok(SplitLine { number, folder: folder.to_owned(), frame, side })
+    Ok(SplitLine { number, folder, frame, side })
+}
+
+/// The one spelling of a path that stays inside the folder that it starts from.
+fn spelled(folder: &str) -> Option<String> {
+    let mut names = Vec::new();
+    for component in Path::new(folder).components() {
+        match component {
+            Component::Normal(name) => names.push(name.to_str()?),
+            Component::CurDir => {}
+            _ => return None,
+        }
+    }
+    Some(if names.is_empty() { ".".to_owned() } else { names.join("/") })
 }
 
 #[cfg(test)]
@@ -114,6 +125,14 @@ mod tests {
         let line = |number, folder: &str, frame, side| SplitLine { number, folder: folder.to_owned(), frame, side };
         assert_eq!(lines, [line(1, "a/b", 5, Side::Left), line(4, "a/c", 12, Side::Right)]);
         assert!(read("\n").unwrap().is_empty());
+    }
+
+    #[test]
+    fn spellings_of_a_folder_are_one_folder() {
+        let lines = read("a/b 3 l\n./a/b 3 l\na//b/ 0000000003 l\na/./b 3 l\n././ 3 l\n. 3 l").unwrap();
+        let folders: Vec<&str> = lines.iter().map(|line| line.folder.as_str()).collect();
+        assert_eq!(folders, ["a/b", "a/b", "a/b", "a/b", ".", "."]);
+        assert!(lines.iter().all(|line| line.frame == 3));
     }
 
     #[test]

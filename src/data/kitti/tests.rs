@@ -154,6 +154,70 @@ fn a_picture_that_is_cut_is_an_error_with_its_path() {
 }
 
 #[test]
+fn frames_without_the_depth_that_was_asked_for_are_counted_and_say_where_it_was_looked_for() {
+    let root = made_up(3..7);
+    let with = |ground_truth| Options { ground_truth, ..TARGET_ONLY };
+    for (ground_truth, what, place) in [
+        (GroundTruth::Improved, "the improved ground truth", "proj_depth/groundtruth/image_02/0000000003.png"),
+        (GroundTruth::Lidar(DepthAxis::CameraZ), "the LiDAR scan", "velodyne_points/data/0000000003.bin"),
+    ] {
+        if ground_truth != GroundTruth::Improved {
+            fs::write(root.path().join("day/calib_velo_to_cam.txt"), "R: 1 0 0 0 1 0 0 0 1\nT: 0 0 0\n").unwrap();
+            let lines = "S_rect_02: 24 16\nS_rect_03: 24 16\nR_rect_00: 1 0 0 0 1 0 0 0 1\n\
+                         P_rect_02: 12 0 11 0 0 12 7 0 0 0 1 0\nP_rect_03: 12 0 13 0 0 12 7 0 0 0 1 0\n";
+            fs::write(root.path().join("day/calib_cam_to_cam.txt"), lines).unwrap();
+        }
+        let error = message(open(root.path(), None, with(ground_truth)));
+        for part in ["8 frames lack it;", what, place] {
+            assert!(error.contains(part), "{part}: {error}");
+        }
+        let error = message(open(root.path(), None, Options { neighbours: true, ..with(ground_truth) }));
+        assert!(error.contains("4 frames lack it, and 4 more lack a neighbour"), "{error}");
+    }
+    // With pictures alone missing, depth is not what is missed.
+    let error = message(open(made_up(3..5).path(), None, PUBLISHED));
+    assert!(
+        error.contains("with both neighbours") && error.contains("4 frames") && !error.contains("depth"),
+        "{error}"
+    );
+    // Where some have it, the others are counted.
+    let depth = DepthMap { width: 1, height: 1, metres: vec![2.0] };
+    write_depth_png(root.path().join("day/drive/proj_depth/groundtruth/image_03/0000000005.png"), &depth).unwrap();
+    let kitti = open(root.path(), None, with(GroundTruth::Improved)).unwrap();
+    assert_eq!((kitti.len(), kitti.left_out().without_depth), (1, 7));
+    let list = "day/drive 5 r\nday/drive 5 l\nday/drive 6 l";
+    let error = message(open(root.path(), Some(list), with(GroundTruth::Improved)));
+    assert!(error.contains("line 2") && error.contains("2 of the list's 3 frames lack it"), "{error}");
+}
+
+#[test]
+fn frames_are_found_by_any_ending() {
+    let root = made_up(3..7);
+    let data = root.path().join("day/drive/image_02/data");
+    for (number, ending) in [(3, "JPG"), (4, "jpeg"), (5, "webp"), (6, "PNG")] {
+        let old = data.join(format!("{number:010}.png"));
+        let picture = image::open(&old).unwrap();
+        fs::remove_file(&old).unwrap();
+        picture.save(data.join(format!("{number:010}.{ending}"))).unwrap();
+    }
+    let kitti = open(root.path(), None, TARGET_ONLY).unwrap();
+    assert_eq!(kitti.len(), 8);
+    for sample in 0..4 {
+        let red = kitti.image(sample, 0).unwrap().get_pixel(0, 0)[0];
+        assert!(red.abs_diff(10 * (sample as u8 + 3)) < 4, "{red} of frame {}", kitti.name(sample));
+    }
+    assert!(open(root.path(), Some("day/drive 4 l\n./day/drive 5 l"), PUBLISHED).is_ok());
+}
+
+#[test]
+fn spellings_of_a_drive_are_one_drive() {
+    let root = made_up(3..7);
+    let kitti = open(root.path(), Some("day/drive 4 l\n./day//drive/ 4 l"), PUBLISHED).unwrap();
+    assert_eq!(names(&kitti), ["day/drive 4 l", "day/drive 4 l"]);
+    assert_eq!(kitti.drives.len(), 1);
+}
+
+#[test]
 fn depth_files_are_found_by_camera() {
     let root = made_up(3..7);
     let depth = DepthMap { width: 3, height: 2, metres: vec![0.0, 1.5, 2.0, 80.0, 0.25, 10.0] };
