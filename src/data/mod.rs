@@ -45,6 +45,11 @@ pub trait Dataset: Send + Sync {
         Vec::new()
     }
 
+    /// The samples that were left out when the data were opened because a frame of theirs cannot be read: name, and why.
+    fn unreadable(&self) -> &[(String, String)] {
+        &[]
+    }
+
     /// Ground-truth depth of the target frame at its own size, where there is one.
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>>;
 }
@@ -80,6 +85,9 @@ impl Dataset for Subset {
     }
     fn cameras(&self) -> Vec<String> {
         self.data.cameras()
+    }
+    fn unreadable(&self) -> &[(String, String)] {
+        self.data.unreadable()
     }
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {
         self.data.depth(self.samples[sample])

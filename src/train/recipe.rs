@@ -208,6 +208,9 @@ pub struct RunConfig {
     /// The camera that took a folder's pictures.
     #[serde(default)]
     pub camera: Camera,
+    /// Whether samples with a frame that cannot be read are passed over and counted; they end the run otherwise.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub skip_bad_frames: bool,
     /// Weights to start from: files or folders, all four networks together.
     #[serde(default, deserialize_with = "none_one_or_many", skip_serializing_if = "Vec::is_empty")]
     pub init: Vec<PathBuf>,
@@ -263,6 +266,7 @@ impl RunConfig {
             split: None,
             val_split: None,
             camera: Camera::Auto,
+            skip_bad_frames: false,
             init: Vec::new(),
             init_encoder: None,
             init_pose: None,

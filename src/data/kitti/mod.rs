@@ -71,6 +71,8 @@ pub struct Options {
     pub camera: Camera,
     /// Which depth.
     pub ground_truth: GroundTruth,
+    /// Whether samples are left out whose pictures cannot be read, by their headers; otherwise they are an error.
+    pub skip_bad_frames: bool,
     /// How many bytes of resized pictures are kept in memory; beyond them frames are decoded each time.
     pub cache_bytes: usize,
 }
@@ -83,6 +85,7 @@ impl Default for Options {
             stereo: false,
             camera: Camera::Auto,
             ground_truth: GroundTruth::Auto,
+            skip_bad_frames: false,
             cache_bytes: 1 << 30,
         }
     }
@@ -164,6 +167,7 @@ pub struct Kitti {
     /// Of each drive and side.
     cameras: BTreeMap<(usize, Side), camera::Found>,
     left_out: LeftOut,
+    unreadable: Vec<(String, String)>,
     cache: Mutex<Cache>,
 }
 
@@ -198,6 +202,7 @@ impl Kitti {
             options,
             cameras: BTreeMap::new(),
             left_out: LeftOut::default(),
+            unreadable: Vec::new(),
             cache: Mutex::default(),
         };
         match split {
@@ -246,7 +251,14 @@ impl Kitti {
                 }
             };
             let frame = Frame { drive, number: line.frame, side: line.side };
-            self.check_pictures(frame, &mut checked).map_err(|e| at(e.to_string()))?;
+            if let Err(error) = self.check_pictures(frame, &mut checked) {
+                // That a frame is not there is a fault of the list.
+                if !(self.options.skip_bad_frames && self.has_pictures(frame)) {
+                    return Err(at(error.to_string()));
+                }
+                self.unreadable.push((self.name_of(frame), error.to_string()));
+                continue;
+            }
             if let Some(missing) = self.missing_truth(frame) {
                 // The others are counted before this is reported.
                 lacking.get_or_insert((line.number, missing));
@@ -256,7 +268,14 @@ impl Kitti {
             self.check_truth(frame).map_err(|e| at(e.to_string()))?;
             self.samples.push(frame);
         }
-        let Some((number, missing)) = lacking else { return Ok(()) };
+        let Some((number, missing)) = lacking else {
+            return match (self.samples.is_empty(), self.unreadable.first()) {
+                (true, Some((_, why))) => {
+                    Err(Error::file(split, format!("no frame of it can be read; the first: {why}")))
+                }
+                _ => Ok(()),
+            };
+        };
         let (what, without) = (self.options.ground_truth.name(), self.left_out.without_depth);
         let message = format!(
             "line {number}: {}: {what} of this frame is missing ({without} of the list's {} frames lack it); use a list \
@@ -283,7 +302,13 @@ impl Kitti {
                         self.left_out.without_depth += 1;
                         self.left_out.first_depth.get_or_insert(missing);
                     } else {
-                        self.check_pictures(frame, &mut checked)?;
+                        if let Err(error) = self.check_pictures(frame, &mut checked) {
+                            if !self.options.skip_bad_frames {
+                                return Err(error);
+                            }
+                            self.unreadable.push((self.name_of(frame), error.to_string()));
+                            continue;
+                        }
                         self.check_truth(frame)?;
                         self.samples.push(frame);
                     }
@@ -304,6 +329,9 @@ impl Kitti {
             (false, true) => " with the other camera's frame",
             (false, false) => "",
         };
+        if let Some((_, why)) = self.unreadable.first() {
+            return format!("none of {} frames{wanted} can be read; the first: {why}", self.unreadable.len());
+        }
         let LeftOut { without_pictures, without_depth, first_depth } = &self.left_out;
         match (without_pictures, first_depth) {
             (0, None) => format!(
@@ -402,6 +430,11 @@ impl Kitti {
         }
     }
 
+    /// As the line of a split list: `FOLDER FRAME SIDE`.
+    fn name_of(&self, frame: Frame) -> String {
+        format!("{} {} {}", self.drives[frame.drive].folder, frame.number, frame.side.letter())
+    }
+
     /// The file of `frame`; where there is none the message says what it is to `target`.
     fn picture_path(&self, frame: Frame, target: Frame) -> Result<PathBuf> {
         self.drives[frame.drive].picture(frame.number, frame.side).map_err(|expected| {
@@ -487,10 +520,12 @@ impl Dataset for Kitti {
         self.samples.len()
     }
 
-    /// As the line of a split list: `FOLDER FRAME SIDE`.
     fn name(&self, sample: usize) -> String {
-        let frame = self.samples[sample];
-        format!("{} {} {}", self.drives[frame.drive].folder, frame.number, frame.side.letter())
+        self.name_of(self.samples[sample])
+    }
+
+    fn unreadable(&self) -> &[(String, String)] {
+        &self.unreadable
     }
 
     fn image(&self, sample: usize, offset: i32) -> Result<Arc<RgbImage>> {

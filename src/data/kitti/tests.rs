@@ -48,6 +48,7 @@ const TARGET_ONLY: Options = Options {
     stereo: false,
     camera: Camera::KittiPublished,
     ground_truth: GroundTruth::Auto,
+    skip_bad_frames: false,
     cache_bytes: 0,
 };
 
@@ -137,6 +138,27 @@ fn what_cannot_be_used_is_found_at_opening() {
     let improved = Options { ground_truth: GroundTruth::Improved, ..TARGET_ONLY };
     let error = message(open(root.path(), Some("day/drive 5 l"), improved));
     assert!(error.contains("line 1") && error.contains("proj_depth/groundtruth/image_02/0000000005.png"), "{error}");
+}
+
+#[test]
+fn frames_that_cannot_be_read_are_left_out_if_they_may_be() {
+    let root = made_up(3..9);
+    fs::write(root.path().join("day/drive/image_02/data/0000000008.png"), b"not a picture").unwrap();
+    let skipping = Options { skip_bad_frames: true, ..PUBLISHED };
+    let list = "day/drive 4 l\nday/drive 7 l\nday/drive 7 r";
+    for (lines, expected) in [(Some(list), 2), (None, 7)] {
+        assert!(message(open(root.path(), lines, PUBLISHED)).contains("0000000008.png"));
+        let kitti = open(root.path(), lines, skipping).unwrap();
+        assert_eq!(kitti.len(), expected);
+        let [(name, why)] = kitti.unreadable() else { panic!("{:?}", kitti.unreadable()) };
+        assert!(name == "day/drive 7 l" && why.contains("0000000008.png") && why.contains("decode"), "{name}: {why}");
+    }
+    let error = message(open(root.path(), Some("day/drive 7 l"), skipping));
+    assert!(error.contains("split.txt") && error.contains("0000000008.png"), "{error}");
+    // What a list should not have named is an error all the same.
+    assert!(
+        message(open(root.path(), Some("day/drive 9 l"), skipping)).contains("0000000009.png: the frame is missing")
+    );
 }
 
 #[test]
