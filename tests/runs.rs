@@ -185,6 +185,60 @@ fn a_frame_that_cannot_be_read_stops_the_run_with_its_name_and_keeps_what_was_le
 }
 
 #[test]
+fn a_frame_that_cannot_be_read_is_passed_over_if_it_may_be_and_is_named_at_the_end() {
+    let place = tempfile::tempdir().expect("a folder");
+    let broken = |lost| Arc::new(Patchy { street: street(1), samples: 6, has_depth: |_| false, lost: Some(lost) });
+    let config = RunConfig { skip_bad_frames: true, ..config() };
+    let broken = RunData { train: broken(4), validation: broken(0), ..data() };
+    let (metrics, warnings) = finished(&place.path().join("run"), config, &broken);
+    assert_eq!((metrics.steps, metrics.skipped), (5, 2), "{warnings:?}");
+    let first = metrics.first_skipped.expect("named");
+    assert!(first.contains("patchy frame") && first.contains("lost.png"), "{first}");
+    assert!(log(&place.path().join("run")).iter().any(|line| line["photometric"].is_f64() && line["best"] == true));
+}
+
+#[test]
+fn training_on_a_folder_with_a_broken_frame_goes_on_where_that_is_asked_for() {
+    let place = tempfile::tempdir().expect("a folder");
+    let path = |name: &str| place.path().join(name).to_str().expect("a path in UTF-8").to_owned();
+    let size = ["--sequences", "1", "--frames", "14", "--height", "64", "--width", "96"];
+    assert!(parallax(&[&["data", "street", "--out", &path("street")][..], &size].concat()).status.success());
+    // Its header is whole, its pixels are not; training sees every sample.
+    let frame = place.path().join("street/2011_09_26/2011_09_26_drive_0000_sync/image_02/data/0000000000.png");
+    let bytes = std::fs::read(&frame).expect("a frame");
+    std::fs::write(&frame, &bytes[..bytes.len() / 2]).expect("cut");
+    let mut short = config();
+    (short.steps, short.rotations.share, short.data) = (7, 0.0, path("street"));
+    std::fs::write(path("config.toml"), toml::to_string(&short).expect("TOML")).expect("written");
+    let (config, run) = (path("config.toml"), path("run"));
+    fails(&["train", "--config", &config, "--out", &run], 1, &["0000000000.png", "cut short"]);
+    let output = parallax(&["train", "--resume", &run, "--skip-bad-frames"]);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{said}");
+    let last = said.lines().last().expect("a last line");
+    for word in ["done in", "1 samples were skipped", "2011_09_26_drive_0000_sync 1 l", "0000000000.png", "cut short"] {
+        assert!(last.contains(word), "{word}: {last}");
+    }
+}
+
+#[test]
+fn a_frame_in_both_lists_is_refused_by_name_however_it_is_spelled() {
+    let place = tempfile::tempdir().expect("a folder");
+    let path = |name: &str| place.path().join(name).to_str().expect("a path in UTF-8").to_owned();
+    let size = ["--sequences", "1", "--frames", "9", "--height", "64", "--width", "96"];
+    assert!(parallax(&[&["data", "street", "--out", &path("street")][..], &size].concat()).status.success());
+    let drive = "2011_09_26/2011_09_26_drive_0000_sync";
+    let lines = |spelled: &str, frames: [u32; 4]| frames.map(|n| format!("{spelled} {n} l\n")).concat();
+    std::fs::write(path("train.txt"), lines(drive, [1, 2, 3, 4])).expect("written");
+    std::fs::write(path("val.txt"), lines(&format!("./{}", drive.replace('/', "//")), [4, 5, 6, 7])).expect("written");
+    let size = ["--preset", "pico", "--height", "64", "--width", "96", "--batch", "2", "--steps", "1"];
+    let data = ["--data", &path("street"), "--split", &path("train.txt"), "--val-split", &path("val.txt")];
+    let run = path("run");
+    let all = [&["train", "--out", &run][..], &data, &size].concat();
+    fails(&all, 1, &["val.txt", &format!("{drive} 4 l is trained on, too")]);
+}
+
+#[test]
 fn numbers_that_are_not_finite_are_neither_saved_nor_best() {
     let place = tempfile::tempdir().expect("a folder");
     let folder = place.path().join("run");

@@ -4,18 +4,25 @@ use std::path::{Path, PathBuf};
 
 use parallax::Result;
 use parallax::data::Dataset;
-use parallax::data::kitti::{Camera, DepthAxis, GroundTruth, Kitti, Options};
-use parallax::eval::metrics::{Protocol, Scale};
-use parallax::eval::predictor::{Evaluation, Predictor, evaluate};
+use parallax::data::kitti::{Camera, DepthAxis, GroundTruth, Kitti, LeftOut, Options};
+use parallax::eval::metrics::{Protocol, Report, STEREO_SCALE, Scale};
+use parallax::eval::predictions::Predictions;
+use parallax::eval::predictor::{Evaluation, Predictor, evaluate, evaluate_predictions};
 use parallax::street::{Street, StreetConfig};
 use parallax::weights::Weights;
+use serde::Serialize;
 
 use super::progress::Progress;
 
 #[derive(clap::Args)]
+#[command(mut_arg("weights", |weights| weights.required(false).required_unless_present("disparities")))]
 pub struct Args {
     #[command(flatten)]
     weights: super::weights::WeightsArgs,
+    /// Measure what another program predicted: a .npy file of inverse depths `[frames, height, width]`, up to a factor (not
+    /// the sigmoid), one map for each frame in the order of the split.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["weights", "allow_partial", "height", "width", "flip"])]
+    disparities: Option<PathBuf>,
     /// What to measure on: `street` (of a seed that no run trains on) or a folder in the layout of KITTI raw.
     #[arg(long, value_name = "street|DIR", default_value = "street")]
     data: String,
@@ -34,39 +41,137 @@ pub struct Args {
     /// Seed of the street.
     #[arg(long, value_name = "N", default_value_t = 3_000_000)]
     seed: u64,
-    /// Print one JSON object.
-    #[arg(long)]
+    /// Print one JSON object: what was measured, how, and the metrics of all and of each image.
+    ///
+    /// weights or disparities, data, split, protocol, scale, flip, height, width (of the predictions), frames, images
+    /// (those that were measured), skipped: [{why, frames, first}], abs_rel, sq_rel, rmse, rmse_log, a1, a2, a3,
+    /// ratio_median, ratio_std, per_image, without_pixels, without_depth.
+    #[arg(long, verbatim_doc_comment)]
     json: bool,
 }
 
+/// What predicts.
+enum By {
+    Network(Box<Predictor>),
+    File(Predictions),
+}
+
+/// What was measured, and what came out.
+#[derive(Serialize)]
+struct Measured {
+    weights: Option<String>,
+    disparities: Option<PathBuf>,
+    data: String,
+    split: Option<PathBuf>,
+    protocol: Protocol,
+    scale: String,
+    flip: bool,
+    height: usize,
+    width: usize,
+    /// All that were looked at: those that were measured, and those that were not.
+    frames: usize,
+    skipped: Vec<Skipped>,
+    #[serde(flatten)]
+    report: Report,
+}
+
+/// Frames that are in none of the numbers.
+#[derive(Serialize)]
+struct Skipped {
+    why: &'static str,
+    frames: usize,
+    first: Option<String>,
+}
+
+/// The frames that are not in a report, by why.
+fn skipped(report: &Report, left_out: &LeftOut) -> Vec<Skipped> {
+    let listed = |why, names: &[String]| Skipped { why, frames: names.len(), first: names.first().cloned() };
+    let missing = left_out.first_depth.as_ref().map(|path| path.display().to_string());
+    let all = [
+        Skipped { why: "no ground-truth depth", frames: left_out.without_depth, first: missing },
+        listed("no ground-truth depth", &report.without_depth),
+        listed("no pixel of the ground truth counts under this protocol", &report.without_pixels),
+    ];
+    all.into_iter().filter(|skipped| skipped.frames > 0).collect()
+}
+
 pub fn run(args: Args) -> Result<()> {
-    let Weights { model, params, setup, .. } = args.weights.load()?;
-    let (height, width) = (setup.height, setup.width);
-    let data: Box<dyn Dataset> = if args.data == "street" {
-        let street = StreetConfig { height, width, sequences: 8, seed: args.seed, ..StreetConfig::default() };
-        Box::new(Street::render(&street, None))
-    } else {
-        let ground_truth = match args.protocol {
-            Protocol::Eigen => GroundTruth::Lidar(DepthAxis::LidarX),
-            Protocol::EigenCameraZ => GroundTruth::Lidar(DepthAxis::CameraZ),
-            Protocol::Improved | Protocol::Dense => GroundTruth::Improved,
-        };
-        // Depth is compared pixel by pixel: whichever camera took the pictures.
-        let camera = Camera::KittiPublished;
-        let options = Options { neighbours: false, ground_truth, camera, ..Options::default() };
-        Box::new(Kitti::open(Path::new(&args.data), args.split.as_deref(), height, width, options)?)
+    let (by, (height, width)) = match &args.disparities {
+        Some(path) => {
+            let found = Predictions::read(path)?;
+            let size = found.size;
+            (By::File(found), size)
+        }
+        None => {
+            let Weights { model, params, setup, .. } = args.weights.load()?;
+            (By::Network(Box::new(Predictor::new(&model, &params, &setup))), (setup.height, setup.width))
+        }
     };
-    let samples: Vec<usize> = (0..data.len()).collect();
-    let predictor = Predictor::new(&model, &params, &setup);
-    let mut progress = Progress::new("images", samples.len() as u64);
+    let (data, left_out) = args.open(height, width)?;
+    let mut progress = Progress::new("images", data.len() as u64);
     let how = Evaluation { protocol: args.protocol, scale: args.scale, flip: args.flip };
-    let report = evaluate(&predictor, data.as_ref(), &samples, how, |done| progress.set(done as u64, ""))?;
+    let seen = |done| progress.set(done as u64, "");
+    let report = match &by {
+        By::Network(predictor) => {
+            let samples: Vec<usize> = (0..data.len()).collect();
+            evaluate(predictor, data.as_ref(), &samples, how, seen)?
+        }
+        By::File(predictions) => evaluate_predictions(predictions, data.as_ref(), how, seen)?,
+    };
     progress.finish();
+    let measured = Measured {
+        weights: args.disparities.is_none().then(|| args.weights.name()),
+        disparities: args.disparities,
+        data: match args.data.as_str() {
+            "street" => format!("street of seed {}", args.seed),
+            folder => folder.to_owned(),
+        },
+        split: args.split,
+        protocol: args.protocol,
+        scale: args.scale.to_string(),
+        flip: args.flip,
+        height,
+        width,
+        frames: data.len() + left_out.without_depth,
+        skipped: skipped(&report, &left_out),
+        report,
+    };
     if args.json {
-        return super::print_json(&report);
+        return super::print_json(&measured);
+    }
+    print(&measured, args.scale);
+    Ok(())
+}
+
+fn print(measured: &Measured, scale: Scale) {
+    let Measured { report, height, width, .. } = measured;
+    let flipped = if measured.flip { ", joined with the mirrored picture's" } else { "" };
+    match (&measured.weights, &measured.disparities) {
+        (_, Some(file)) => say!("file      {}, maps of {width}x{height}", file.display()),
+        (weights, None) => {
+            say!("weights   {}, maps of {width}x{height}{flipped}", weights.as_deref().unwrap_or_default());
+        }
+    }
+    let listed = measured.split.as_ref().map_or_else(String::new, |list| format!(", frames of {}", list.display()));
+    say!("data      {}{listed}", measured.data);
+    let pixels = match measured.protocol {
+        Protocol::Dense => "0.001 to 80 m, the whole picture",
+        Protocol::Eigen => "0.001 to 80 m within Garg's crop, the LiDAR's x",
+        Protocol::EigenCameraZ => "0.001 to 80 m within Garg's crop, the camera's z",
+        Protocol::Improved => "every pixel of the improved ground truth",
+    };
+    say!("protocol  {}: {pixels}", measured.protocol);
+    match scale {
+        Scale::Median => say!("scaling   each image by the ratio of the medians"),
+        Scale::Stereo => say!("scaling   stereo: times {STEREO_SCALE}"),
+        Scale::Factor(factor) => say!("scaling   times {factor}"),
+    }
+    say!("images    {} of {} frames", report.images, measured.frames);
+    for Skipped { why, frames, first } in &measured.skipped {
+        let first = first.as_ref().map_or_else(String::new, |first| format!(" (the first: {first})"));
+        say!("skipped   {frames}: {why}{first}");
     }
     let m = report.metrics;
-    say!("images    {}", report.images);
     for (name, value) in [
         ("Abs Rel", m.abs_rel),
         ("Sq Rel", m.sq_rel),
@@ -81,5 +186,25 @@ pub fn run(args: Args) -> Result<()> {
     if let (Some(ratio), Some(std)) = (report.ratio_median, report.ratio_std) {
         say!("scale     median ratio {ratio:.3}, deviation {std:.3}");
     }
-    Ok(())
+}
+
+impl Args {
+    /// What is measured on, and which of its frames cannot be.
+    fn open(&self, height: usize, width: usize) -> Result<(Box<dyn Dataset>, LeftOut)> {
+        if self.data == "street" {
+            let street = StreetConfig { height, width, sequences: 8, seed: self.seed, ..StreetConfig::default() };
+            return Ok((Box::new(Street::render(&street, None)), LeftOut::default()));
+        }
+        let ground_truth = match self.protocol {
+            Protocol::Eigen => GroundTruth::Lidar(DepthAxis::LidarX),
+            Protocol::EigenCameraZ => GroundTruth::Lidar(DepthAxis::CameraZ),
+            Protocol::Improved | Protocol::Dense => GroundTruth::Improved,
+        };
+        // Depth is compared pixel by pixel: whichever camera took the pictures.
+        let camera = Camera::KittiPublished;
+        let options = Options { neighbours: false, ground_truth, camera, ..Options::default() };
+        let kitti = Kitti::open(Path::new(&self.data), self.split.as_deref(), height, width, options)?;
+        let left_out = kitti.left_out().clone();
+        Ok((Box::new(kitti), left_out))
+    }
 }

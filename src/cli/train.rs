@@ -87,6 +87,10 @@ pub struct Args {
     /// Start from those weights that fit; the others are listed.
     #[arg(long)]
     allow_partial: bool,
+    /// Pass over samples with a frame that cannot be read, and say at the end how many they were. Without, the first one
+    /// ends the run.
+    #[arg(long)]
+    skip_bad_frames: bool,
     /// Go on with an interrupted run.
     #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "config", "init", "init_encoder", "init_pose", "split", "preset"])]
     resume: Option<PathBuf>,
@@ -127,7 +131,7 @@ pub fn run(args: Args) -> Result<()> {
     let folder = run.folder.display();
     match ended {
         Ended::Interrupted(step) => {
-            note!("stopped after step {step}; go on with: parallax train --resume {folder}");
+            note!("stopped after step {step}; go on with: parallax train --resume {folder}{}", skipped(&run));
             // As the shell says it of a program that Ctrl-C ended: scripts can tell this from done.
             std::process::exit(130);
         }
@@ -140,10 +144,22 @@ pub fn run(args: Args) -> Result<()> {
             let start = if from_files { "start" } else { "untrained" };
             print_metrics(&metrics, start);
             let seconds = began.elapsed().as_secs_f64();
-            note!("done in {seconds:.0} s, {:.0} s of them training; look at {folder}/images", metrics.seconds);
+            let skipped = skipped(&run);
+            note!(
+                "done in {seconds:.0} s, {:.0} s of them training; look at {folder}/images{skipped}",
+                metrics.seconds
+            );
         }
     }
     Ok(())
+}
+
+/// How many samples were passed over, and the first of them; nothing if there was none.
+fn skipped(run: &Run) -> String {
+    match (run.skipped().count(), run.skipped().first()) {
+        (n, Some(first)) => format!("; {n} samples were skipped because a frame cannot be read, the first: {first}"),
+        _ => String::new(),
+    }
 }
 
 /// Cameras that are called by a name.
@@ -241,6 +257,7 @@ fn resume(args: &Args, folder: &Path) -> Result<(Run, RunData)> {
         if let Some(steps) = args.steps {
             config.steps = steps;
         }
+        config.skip_bad_frames |= args.skip_bad_frames;
         Ok(())
     };
     let run = Run::resume_with(folder, change, |warning| note!("warning: {warning}"))?;
@@ -286,7 +303,8 @@ fn print_metrics(m: &RunMetrics, start: &str) {
 }
 
 impl Args {
-    /// Of a run that goes on, only where its data are and how many steps it takes can be said anew.
+    /// Of a run that goes on, only where its data are, how many steps it takes and whether bad frames are passed over can
+    /// be said anew.
     fn refuse_what_cannot_change(&self) -> Result<()> {
         let given = [
             ("--height", self.height.is_some()),
@@ -356,6 +374,7 @@ fn configuration(args: &Args) -> Result<RunConfig> {
         c.init = args.init.iter().map(|p| std::path::absolute(p).unwrap_or_else(|_| p.clone())).collect();
     }
     c.allow_partial |= args.allow_partial;
+    c.skip_bad_frames |= args.skip_bad_frames;
     c.camera = match (&args.intrinsics, args.fov, args.camera) {
         (Some(numbers), ..) => match numbers[..] {
             [fx, fy, cx, cy] => Camera::Pixels { fx, fy, cx, cy },

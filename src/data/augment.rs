@@ -29,12 +29,13 @@ pub fn flip(image: &RgbImage) -> RgbImage {
     image::imageops::flip_horizontal(image)
 }
 
-/// The camera of a mirrored picture of `width` pixels: its centre moves to `W - 1 - cx`. The published constants of
-/// KITTI are left alone, as in the published training: their centre is a convention, not a measurement.
+/// The camera of a mirrored picture of `width` pixels. Pixel centres are whole numbers, so pixel u becomes W - 1 - u, and
+/// the principal point with it: `cx' = 1 - 1/W - cx` over the width. That of 0.5 becomes 0.496875 at 320 pixels.
+///
+/// Constants that are a convention and no measurement stay as they are: [`Dataset::mirrored_intrinsics`] decides.
+///
+/// [`Dataset::mirrored_intrinsics`]: super::Dataset::mirrored_intrinsics
 pub fn flip_intrinsics(camera: Intrinsics, width: usize) -> Intrinsics {
-    if camera == Intrinsics::KITTI {
-        return camera;
-    }
     let width = width as f64;
     Intrinsics { cx: (width - 1.0) / width - camera.cx, ..camera }
 }
@@ -279,11 +280,14 @@ mod tests {
     }
 
     #[test]
-    fn flipping_moves_pixels_and_the_measured_centre() {
+    fn flipping_moves_pixels_and_the_centre() {
         let ramp = RgbImage::from_fn(4, 1, |x, _| image::Rgb([x as u8, 0, 0]));
         let reds: Vec<u8> = flip(&ramp).pixels().map(|p| p[0]).collect();
         assert_eq!(reds, [3, 2, 1, 0]);
-        assert_eq!(flip_intrinsics(Intrinsics::KITTI, 320), Intrinsics::KITTI);
+        // What a camera is called is no matter: the same numbers may be measured, as those of the street are.
+        let street = flip_intrinsics(Intrinsics::KITTI, 320);
+        assert!((street.cx - 0.496875).abs() < 1e-12);
+        assert_eq!(Intrinsics { cx: 0.5, ..street }, Intrinsics::KITTI);
         let camera = Intrinsics { fx: 0.5, fy: 1.0, cx: 0.49, cy: 0.4 };
         let flipped = flip_intrinsics(camera, 100);
         assert!((flipped.cx * 100.0 - (99.0 - 49.0)).abs() < 1e-9);

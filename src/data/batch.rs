@@ -2,16 +2,17 @@
 //!
 //! What a batch holds is a function of the seed and the step alone, so a resumed run sees what it would have seen.
 
+use std::collections::HashSet;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::Arc;
 use std::sync::mpsc::{Receiver, sync_channel};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
 use super::Dataset;
-use super::augment::{Jitter, flip, flip_intrinsics};
+use super::augment::{Jitter, flip};
 use super::resize::lanczos;
 use crate::camera::Intrinsics;
 use crate::error::{Error, Result};
@@ -109,8 +110,96 @@ pub fn samples_of_step(len: usize, batch: usize, seed: u64, step: u64) -> Vec<us
 /// Scales of the target that the loss looks at.
 const SCALES: usize = 4;
 
+/// The samples that are passed over because a frame of theirs cannot be read; shared by all that read them.
+#[derive(Clone, Debug, Default)]
+pub struct SkipList(Arc<Mutex<Skipped>>);
+
+#[derive(Debug, Default)]
+struct Skipped {
+    names: HashSet<String>,
+    first: Option<String>,
+}
+
+impl SkipList {
+    fn skipped(&self) -> MutexGuard<'_, Skipped> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Adds a sample by its name, and why; whether it is new.
+    pub fn add(&self, name: &str, why: &str) -> bool {
+        let mut skipped = self.skipped();
+        skipped.first.get_or_insert_with(|| format!("{name}: {why}"));
+        skipped.names.insert(name.to_owned())
+    }
+
+    /// How many samples are passed over.
+    pub fn count(&self) -> usize {
+        self.skipped().names.len()
+    }
+
+    /// The first of them, and why.
+    pub fn first(&self) -> Option<String> {
+        self.skipped().first.clone()
+    }
+
+    fn has(&self, name: &str) -> bool {
+        self.skipped().names.contains(name)
+    }
+
+    /// The frames of a sample, or of the next one after it that can be read.
+    fn read(&self, data: &dyn Dataset, sample: usize) -> Result<(usize, [Arc<RgbImage>; 3])> {
+        for sample in (sample..data.len()).chain(0..sample) {
+            let name = data.name(sample);
+            if self.has(&name) {
+                continue;
+            }
+            match frames(data, sample) {
+                Ok(frames) => return Ok((sample, frames)),
+                Err(error) => drop(self.add(&name, &error.to_string())),
+            }
+        }
+        let first = self.first().unwrap_or_default();
+        Err(Error::Failed(format!("none of the {} samples can be read; the first: {first}", data.len())))
+    }
+}
+
+/// The previous, the target and the next frame of a sample.
+fn frames(data: &dyn Dataset, sample: usize) -> Result<[Arc<RgbImage>; 3]> {
+    Ok([data.image(sample, -1)?, data.image(sample, 0)?, data.image(sample, 1)?])
+}
+
 /// The batch of a step (from 0).
+///
+/// # Errors
+/// If a frame cannot be read.
 pub fn batch_of_step(data: &dyn Dataset, augment: Augment, batch: usize, seed: u64, step: u64) -> Result<Batch> {
+    assemble(data, augment, batch, seed, step, None)
+}
+
+/// The batch of a step (from 0), in which the next sample that can be read stands for one that cannot: that is put on the
+/// list. All other samples, and what is done to them, are as in [`batch_of_step`].
+///
+/// # Errors
+/// If no sample can be read.
+pub fn batch_of_readable(
+    data: &dyn Dataset,
+    augment: Augment,
+    batch: usize,
+    seed: u64,
+    step: u64,
+    skip: &SkipList,
+) -> Result<Batch> {
+    assemble(data, augment, batch, seed, step, Some(skip))
+}
+
+fn assemble(
+    data: &dyn Dataset,
+    augment: Augment,
+    batch: usize,
+    seed: u64,
+    step: u64,
+    skip: Option<&SkipList>,
+) -> Result<Batch> {
     let samples = samples_of_step(data.len(), batch, seed, step);
     let mut random = Random::of(seed, Stream::Augmentation(step));
     let mut pyramids: Vec<Vec<Arc<RgbImage>>> = Vec::new();
@@ -120,16 +209,13 @@ pub fn batch_of_step(data: &dyn Dataset, augment: Augment, batch: usize, seed: u
     for sample in samples {
         let (mirrored, jitter) = (random.coin() && augment.flip, Jitter::draw(random.chacha()));
         let jitter = jitter.filter(|_| augment.jitter);
-        let mut camera = data.intrinsics(sample);
-        let mut plain = Vec::new();
-        for offset in [-1, 0, 1] {
-            let image = data.image(sample, offset)?;
-            plain.push(if mirrored { Arc::new(flip(&image)) } else { image });
-        }
+        let (sample, frames) = match skip {
+            Some(skip) => skip.read(data, sample)?,
+            None => (sample, frames(data, sample)?),
+        };
+        let plain = if mirrored { frames.map(|image| Arc::new(flip(&image))) } else { frames };
         let (w, h) = plain[1].dimensions();
-        if mirrored {
-            camera = flip_intrinsics(camera, w as usize);
-        }
+        let camera = if mirrored { data.mirrored_intrinsics(sample, w as usize) } else { data.intrinsics(sample) };
         intrinsics.push(in_pixels(camera, w as usize, h as usize));
         let mut pyramid = vec![plain[1].clone()];
         for s in 1..SCALES {
@@ -155,14 +241,34 @@ pub fn batch_of_step(data: &dyn Dataset, augment: Augment, batch: usize, seed: u
 pub struct Loader {
     batches: Option<Receiver<Result<Batch>>>,
     thread: Option<JoinHandle<()>>,
+    /// Why there are no more batches.
+    stopped: Option<Error>,
+}
+
+/// An error that says the same.
+fn again(error: &Error) -> Error {
+    match error {
+        Error::Io { path, source } => Error::io(path, std::io::Error::new(source.kind(), source.to_string())),
+        Error::File { path, message } => Error::file(path, message),
+        Error::Setting { name, message } => Error::setting(name, message),
+        Error::Failed(message) => Error::Failed(message.clone()),
+    }
 }
 
 impl Loader {
-    /// Starts at `first_step` (from 0).
+    /// Starts at `first_step` (from 0). A sample that cannot be read is an error; with a list to `skip` it is put there,
+    /// and another one stands for it.
     ///
     /// # Errors
     /// If there are fewer samples than a batch holds.
-    pub fn start(data: Arc<dyn Dataset>, augment: Augment, batch: usize, seed: u64, first_step: u64) -> Result<Self> {
+    pub fn start(
+        data: Arc<dyn Dataset>,
+        augment: Augment,
+        batch: usize,
+        seed: u64,
+        first_step: u64,
+        skip: Option<SkipList>,
+    ) -> Result<Self> {
         if batch == 0 || data.len() < batch {
             let message = format!("{batch} samples a batch, but the data holds {}: make it smaller", data.len());
             return Err(Error::setting("batch", message));
@@ -170,7 +276,7 @@ impl Loader {
         let (send, batches) = sync_channel(3);
         let thread = std::thread::spawn(move || {
             for step in first_step.. {
-                let make = || batch_of_step(data.as_ref(), augment, batch, seed, step);
+                let make = || assemble(data.as_ref(), augment, batch, seed, step, skip.as_ref());
                 // A panic becomes an error of this step, not a thread that is gone.
                 let made = catch_unwind(AssertUnwindSafe(make)).unwrap_or_else(|_| {
                     let samples = samples_of_step(data.len(), batch, seed, step);
@@ -188,13 +294,22 @@ impl Loader {
                 }
             }
         });
-        Ok(Loader { batches: Some(batches), thread: Some(thread) })
+        Ok(Loader { batches: Some(batches), thread: Some(thread), stopped: None })
     }
 
     /// The next batch.
+    ///
+    /// # Errors
+    /// If it could not be made; from then on always the same.
     pub fn next_batch(&mut self) -> Result<Batch> {
+        if let Some(error) = &self.stopped {
+            return Err(again(error));
+        }
         let batches = self.batches.as_ref().expect("there until dropped");
-        batches.recv().unwrap_or_else(|_| Err(Error::Failed("the thread that makes batches has stopped".into())))
+        let stopped = |_| Err(Error::Failed("the thread that makes batches has stopped".into()));
+        let next = batches.recv().unwrap_or_else(stopped);
+        self.stopped = next.as_ref().err().map(again);
+        next
     }
 }
 
@@ -212,6 +327,7 @@ impl Drop for Loader {
 mod tests {
     use super::*;
     use crate::street::{Street, StreetConfig};
+    use crate::tensor::Var;
 
     #[test]
     fn smaller_sources_are_made_like_the_pyramid_of_the_target() {
@@ -226,6 +342,130 @@ mod tests {
             assert!(next.same_bits(&batch.pyramid[scale + 1]), "scale {}", scale + 1);
             assert!(!previous.same_bits(next));
         }
+    }
+
+    /// The mean difference between a batch's targets and its next frames, warped by true depths and poses, sample by
+    /// sample.
+    fn warped_with_the_truth(street: &Street, batch: &Batch, samples: &[usize], mirrored: &[bool]) -> Vec<f64> {
+        let (height, width) = (street.config().height, street.config().width);
+        let (mut depths, mut poses) = (Vec::new(), Vec::new());
+        for (&sample, &mirrored) in samples.iter().zip(mirrored) {
+            let depth = street.depth(sample).unwrap().unwrap();
+            let metres: Vec<f32> = depth.metres.iter().map(|&m| if m > 0.0 { m } else { 500.0 }).collect();
+            depths.extend(if mirrored { crate::eval::metrics::mirror(&metres, width) } else { metres });
+            // With x the other way round on both sides.
+            let sign = |axis: usize| if mirrored && axis == 0 { -1.0 } else { 1.0 };
+            for (i, row) in street.relative_pose(sample, 1).iter().enumerate() {
+                poses.extend((0..4).map(|j| (row[j] * sign(i) * sign(j)) as f32));
+            }
+        }
+        let tensor =
+            |shape: &[usize], values: &[f32]| Var::constant(Tensor::build(shape, |out| out.copy_from_slice(values)));
+        let depth = tensor(&[samples.len(), height, width, 1], &depths);
+        let pose = tensor(&[samples.len(), 3, 4], &poses);
+        let warped = Var::constant(batch.sources[1].clone()).warp(&depth, &pose, &batch.intrinsics, true);
+        let each = 3 * height * width;
+        let pairs = warped.value().data().chunks(each).zip(batch.pyramid[0].data().chunks(each));
+        let sum = |(a, b): (&[f32], &[f32])| a.iter().zip(b).map(|(a, b)| f64::from((a - b).abs())).sum::<f64>();
+        pairs.map(|pair| sum(pair) / each as f64).collect()
+    }
+
+    #[test]
+    fn a_mirrored_street_warps_as_well_as_the_street() {
+        let street = Street::render(&StreetConfig { sequences: 2, frames: 6, ..StreetConfig::default() }, None);
+        let samples = samples_of_step(street.len(), 4, 0, 0);
+        let of = |flip: bool| batch_of_step(&street, Augment { flip, jitter: false }, 4, 0, 0).unwrap();
+        let (plain, mixed) = (of(false), of(true));
+        let each = 3 * 96 * 320;
+        let parts = plain.pyramid[0].data().chunks(each).zip(mixed.pyramid[0].data().chunks(each));
+        let mirrored: Vec<bool> = parts.map(|(a, b)| a != b).collect();
+        assert!(mirrored.contains(&true) && mirrored.contains(&false), "{mirrored:?}");
+        let found = warped_with_the_truth(&street, &plain, &samples, &[false; 4]);
+        let again = warped_with_the_truth(&street, &mixed, &samples, &mirrored);
+        for (a, b) in found.iter().zip(&again) {
+            assert!((a / b - 1.0).abs() < 1e-4, "{found:?} {again:?}");
+        }
+        // A pixel beside the true principal point is seen: the comparison above is worth something.
+        let mut beside = mixed;
+        for (k, &mirrored) in beside.intrinsics.iter_mut().zip(&mirrored) {
+            assert_eq!(k[2], if mirrored { 159.0 } else { 160.0 });
+            k[2] = 160.0;
+        }
+        let beside = warped_with_the_truth(&street, &beside, &samples, &mirrored);
+        assert!(beside.iter().zip(&again).zip(&mirrored).all(|((a, b), &m)| (a != b) == m), "{beside:?} {again:?}");
+    }
+
+    /// A street of which some samples cannot be read.
+    struct Damaged(Street, fn(usize) -> bool);
+
+    impl Dataset for Damaged {
+        fn len(&self) -> usize {
+            self.0.len()
+        }
+        fn name(&self, sample: usize) -> String {
+            format!("sample {sample}")
+        }
+        fn image(&self, sample: usize, offset: i32) -> Result<Arc<RgbImage>> {
+            match (self.1)(sample) && offset == 1 {
+                true => Err(Error::file("lost.png", format!("number {sample} cannot be decoded"))),
+                false => self.0.image(sample, offset),
+            }
+        }
+        fn intrinsics(&self, sample: usize) -> Intrinsics {
+            self.0.intrinsics(sample)
+        }
+        fn depth(&self, _sample: usize) -> Result<Option<crate::depth::DepthMap>> {
+            Ok(None)
+        }
+    }
+
+    fn damaged(bad: fn(usize) -> bool) -> Arc<Damaged> {
+        let config = StreetConfig { height: 64, width: 96, sequences: 1, frames: 8, ..StreetConfig::default() };
+        Arc::new(Damaged(Street::render(&config, None), bad))
+    }
+
+    #[test]
+    fn what_stopped_the_batches_is_said_as_often_as_it_is_asked() {
+        let mut loader = Loader::start(damaged(|_| true), Augment::default(), 2, 0, 0, None).unwrap();
+        let first = loader.next_batch().unwrap_err();
+        assert!(matches!(&first, Error::File { path, .. } if path.ends_with("lost.png")), "{first}");
+        for _ in 0..3 {
+            let later = loader.next_batch().unwrap_err();
+            assert!(matches!(later, Error::File { .. }));
+            assert_eq!(later.to_string(), first.to_string());
+        }
+    }
+
+    #[test]
+    fn samples_that_cannot_be_read_are_passed_over_and_counted() {
+        let bad = |sample| sample == 1 || sample == 2;
+        let (data, skip) = (damaged(bad), SkipList::default());
+        let plain = Augment { flip: true, jitter: false };
+        let mut loader = Loader::start(data.clone(), plain, 3, 5, 0, Some(skip.clone())).unwrap();
+        let again = SkipList::default();
+        for step in 0..4 {
+            let batch = loader.next_batch().unwrap();
+            // The others are what they would be without; 3 stands for 1 and 2.
+            let whole = batch_of_step(&data.0, plain, 3, 5, step).unwrap();
+            let known = batch_of_readable(data.as_ref(), plain, 3, 5, step, &again).unwrap();
+            assert!(batch.sources[1].same_bits(&known.sources[1]), "whether it is known beforehand is no matter");
+            let each = 3 * 64 * 96;
+            for (i, sample) in samples_of_step(6, 3, 5, step).into_iter().enumerate() {
+                let of = |batch: &Batch| batch.pyramid[0].data()[i * each..][..each].to_vec();
+                assert_eq!(of(&batch) == of(&whole), !bad(sample), "sample {sample}");
+                if bad(sample) {
+                    let three = data.0.image(3, 0).unwrap();
+                    let both = [to_tensor(&[&three]), to_tensor(&[&flip(&three)])];
+                    assert!(both.iter().any(|image| image.data() == of(&batch)));
+                }
+            }
+        }
+        assert_eq!(skip.count(), 2);
+        let first = skip.first().unwrap();
+        assert!(first.starts_with("sample ") && first.contains("lost.png") && first.contains("decoded"), "{first}");
+
+        let error = batch_of_readable(damaged(|_| true).as_ref(), plain, 1, 0, 0, &SkipList::default()).unwrap_err();
+        assert!(error.to_string().contains("none of the 6 samples can be read"), "{error}");
     }
 
     #[test]

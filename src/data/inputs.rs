@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use crate::{Error, Result};
 
 /// What pictures in a folder end in.
-const ENDINGS: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
+pub(super) const ENDINGS: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
 
 /// A picture to read.
 #[derive(Clone, Debug, PartialEq, Eq)]

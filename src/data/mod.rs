@@ -35,9 +35,20 @@ pub trait Dataset: Send + Sync {
     /// The camera of a sample.
     fn intrinsics(&self, sample: usize) -> Intrinsics;
 
+    /// The camera of a sample's pictures once they are mirrored and `width` pixels wide: its principal point is mirrored
+    /// with them.
+    fn mirrored_intrinsics(&self, sample: usize, width: usize) -> Intrinsics {
+        augment::flip_intrinsics(self.intrinsics(sample), width)
+    }
+
     /// The cameras of all samples in words, each once: intrinsics, and where they were found.
     fn cameras(&self) -> Vec<String> {
         Vec::new()
+    }
+
+    /// The samples that were left out when the data were opened because a frame of theirs cannot be read: name, and why.
+    fn unreadable(&self) -> &[(String, String)] {
+        &[]
     }
 
     /// Ground-truth depth of the target frame at its own size, where there is one.
@@ -70,8 +81,14 @@ impl Dataset for Subset {
     fn intrinsics(&self, sample: usize) -> Intrinsics {
         self.data.intrinsics(self.samples[sample])
     }
+    fn mirrored_intrinsics(&self, sample: usize, width: usize) -> Intrinsics {
+        self.data.mirrored_intrinsics(self.samples[sample], width)
+    }
     fn cameras(&self) -> Vec<String> {
         self.data.cameras()
+    }
+    fn unreadable(&self) -> &[(String, String)] {
+        self.data.unreadable()
     }
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {
         self.data.depth(self.samples[sample])

@@ -4,6 +4,7 @@
 //! into depth, scaled (monocular depth has no scale of its own), cut to [0.001, 80] m and compared where the protocol
 //! looks. Each image gives seven numbers; a report is their means over images.
 
+use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
@@ -53,6 +54,18 @@ impl Protocol {
     }
 }
 
+impl fmt::Display for Protocol {
+    /// The name that it is chosen by.
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str(match self {
+            Protocol::Dense => "dense",
+            Protocol::Eigen => "eigen",
+            Protocol::EigenCameraZ => "eigen-camera-z",
+            Protocol::Improved => "improved",
+        })
+    }
+}
+
 impl FromStr for Protocol {
     type Err = Error;
 
@@ -79,6 +92,17 @@ pub enum Scale {
     Stereo,
     /// Times this.
     Factor(f64),
+}
+
+impl fmt::Display for Scale {
+    /// As it is chosen.
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match self {
+            Scale::Median => f.write_str("median"),
+            Scale::Stereo => f.write_str("stereo"),
+            Scale::Factor(factor) => write!(f, "{factor}"),
+        }
+    }
 }
 
 impl FromStr for Scale {

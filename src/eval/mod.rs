@@ -3,4 +3,5 @@
 pub mod attention;
 pub mod camera_height;
 pub mod metrics;
+pub mod predictions;
 pub mod predictor;

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use super::metrics::{MeanMap, Protocol, Report, Scale, evaluate_image, flip_post_process, mirror};
+use super::predictions::Predictions;
 use crate::data::Dataset;
 use crate::data::augment::flip;
 use crate::data::batch::to_tensor;
@@ -137,6 +138,24 @@ pub fn evaluate(
     })
 }
 
+/// The seven metrics of what another program predicted for every sample of a data set; as [`evaluate`].
+///
+/// # Errors
+/// As [`evaluate`], and if there is not one map for each sample.
+pub fn evaluate_predictions(
+    predictions: &Predictions,
+    data: &dyn Dataset,
+    how: Evaluation,
+    seen: impl FnMut(usize),
+) -> Result<Report> {
+    predictions.check(data.len())?;
+    let samples: Vec<usize> = (0..data.len()).collect();
+    compare(data, &samples, how, seen, |sample| {
+        let map = predictions.map(sample).unwrap_or_default();
+        Ok((map.to_vec(), predictions.size))
+    })
+}
+
 /// The seven metrics of the mean depth map on a data set; as [`evaluate`].
 ///
 /// # Errors
@@ -158,7 +177,8 @@ fn compare(
         match data.depth(sample)? {
             Some(truth) => {
                 let (inverse_depth, size) = predict(sample)?;
-                let found = evaluate_image(&inverse_depth, size, &truth, how.protocol, how.scale)?;
+                let found = evaluate_image(&inverse_depth, size, &truth, how.protocol, how.scale);
+                let found = found.map_err(|e| Error::Failed(format!("{}: {e}", data.name(sample))))?;
                 results.push((data.name(sample), found));
             }
             None => without_depth.push(data.name(sample)),

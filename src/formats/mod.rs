@@ -3,6 +3,7 @@
 //! | module | format |
 //! |---|---|
 //! | [`atomic`] | how every file is written: aside, then renamed |
+//! | [`bounded`] | how whole files are read: never more than such a file may have |
 //! | [`safetensors`] | named tensors, the crate's own checkpoints |
 //! | [`pth`] | named tensors in PyTorch's pickles, read as data |
 //! | [`npz`], [`npy`] | NumPy's archives and arrays |
@@ -14,7 +15,9 @@
 //! [`TensorFile`] opens any file of named tensors.
 
 pub mod atomic;
+pub mod bounded;
 pub mod depth_png;
+mod jpeg_scans;
 pub mod npy;
 pub mod npz;
 pub mod picture;

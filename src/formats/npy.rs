@@ -2,9 +2,24 @@
 
 use std::io::{self, Write};
 use std::path::Path;
+use std::sync::Arc;
 
 use super::atomic::write_atomically;
-use crate::Result;
+use super::bounded::read_bounded;
+use super::npz::read_array;
+use super::pth::MAX_FILE;
+use super::stored::{Storage, StoredTensor};
+use crate::{Error, Result};
+
+/// Reads a `.npy` file, version 1, 2 or 3, of little-endian numbers.
+///
+/// # Errors
+/// If it is none, or not as long as its header says.
+pub fn read(path: &Path) -> Result<StoredTensor> {
+    let bytes = read_bounded(path, MAX_FILE, "an .npy array")?;
+    let whole = Storage { range: 0..bytes.len(), bytes: Arc::new(bytes) };
+    read_array(whole).map_err(|why| Error::file(path, format!("expected an .npy array, which cannot be read: {why}")))
+}
 
 /// Writes a row-major `height x width` map of f32 as `.npy` (version 1.0, little-endian), whole or not at all.
 ///
@@ -68,6 +83,20 @@ mod tests {
         let values: Vec<f32> =
             bytes[10 + length..].chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
         assert_eq!(values, [1.0, 2.5, -3.0, 0.0, f32::INFINITY, 6.0]);
+    }
+
+    #[test]
+    fn what_was_written_reads_back() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("map.npy");
+        let values = [1.0, 2.5, -3.0, 0.0, f32::INFINITY, 6.0];
+        write_npy_shaped(&path, &values, &[1, 2, 3]).unwrap();
+        let found = read(&path).unwrap();
+        assert_eq!((found.shape(), found.to_f32().unwrap()), (&[1, 2, 3][..], values.to_vec()));
+        let bytes = std::fs::read(&path).unwrap();
+        std::fs::write(&path, &bytes[..bytes.len() - 1]).unwrap();
+        let error = read(&path).unwrap_err().to_string();
+        assert!(error.contains("map.npy") && error.contains("number of elements"), "{error}");
     }
 
     #[test]

@@ -97,7 +97,7 @@ pub fn open(path: &Path) -> Result<TensorFile> {
 }
 
 /// An array from the bytes of a `.npy` file (version 1, 2 or 3).
-fn read_array(file: Storage) -> Result<StoredTensor, String> {
+pub(super) fn read_array(file: Storage) -> Result<StoredTensor, String> {
     let bytes = file.bytes.get(file.range.clone()).unwrap_or(&[]);
     let (fixed, length): (usize, usize) = match bytes {
         [0x93, b'N', b'U', b'M', b'P', b'Y', 1, _, a, b, ..] => (10, usize::from(u16::from_le_bytes([*a, *b]))),

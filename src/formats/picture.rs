@@ -3,7 +3,7 @@
 
 use std::cell::Cell;
 use std::fs::File;
-use std::io::{Cursor, Read};
+use std::io::{BufRead, BufReader, Cursor, Read, Seek};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::sync::Once;
@@ -23,6 +23,15 @@ pub const MAX_BYTES: u64 = 1 << 30;
 /// A header lies within so many bytes, nearly always.
 const HEAD: u64 = 64 << 10;
 
+/// What may stand in front of a header: a colour profile, previews.
+const MAX_PREFACE: u64 = 32 << 20;
+
+/// Whether a picture may be so large: whole pixels, at least one each way, at most [`MAX_PIXELS`].
+pub fn is_size(width: f64, height: f64) -> bool {
+    let whole = |n: f64| n >= 1.0 && n.fract() == 0.0;
+    whole(width) && whole(height) && width * height <= MAX_PIXELS as f64
+}
+
 /// Reads the header alone: width and height as they are stored, before any orientation is applied.
 ///
 /// # Errors
@@ -31,11 +40,20 @@ pub fn check_picture(path: &Path) -> Result<(u32, u32)> {
     let file = open(path)?;
     let mut head = Vec::new();
     (&file).take(HEAD).read_to_end(&mut head).map_err(|e| Error::io(path, e))?;
-    let dimensions = match dimensions(&head) {
-        // A header behind a long preface (a colour profile, a preview): read on.
+    let dimensions = match dimensions(Cursor::new(&head)) {
         Err(_) if head.len() as u64 == HEAD => {
-            (&file).read_to_end(&mut head).map_err(|e| Error::io(path, e))?;
-            dimensions(&head)
+            let mut reader = BufReader::new(&file);
+            reader.rewind().map_err(|e| Error::io(path, e))?;
+            match head.starts_with(b"\xff\xd8") {
+                // A header behind a long preface: read on.
+                true => {
+                    head.clear();
+                    reader.take(MAX_PREFACE).read_to_end(&mut head).map_err(|e| Error::io(path, e))?;
+                    dimensions(Cursor::new(&head))
+                }
+                // A WebP's blocks are passed over, not read.
+                false => dimensions(reader),
+            }
         }
         result => result,
     };
@@ -52,8 +70,18 @@ fn open(path: &Path) -> Result<File> {
     Ok(file)
 }
 
-fn dimensions(bytes: &[u8]) -> Result<(u32, u32), Undecodable> {
-    fenced(|| ImageReader::new(Cursor::new(bytes)).with_guessed_format()?.into_dimensions())
+/// Width and height by the header. Of a PNG nothing else is looked at: its decoder would unpack a colour profile first,
+/// whatever that comes to.
+fn dimensions(mut file: impl BufRead + Seek) -> Result<(u32, u32), Undecodable> {
+    fenced(|| {
+        let mut start = Vec::new();
+        (&mut file).take(structure::PNG_HEADER).read_to_end(&mut start)?;
+        if let Some(size) = structure::png_size(&start) {
+            return Ok(size);
+        }
+        file.rewind()?;
+        ImageReader::new(file).with_guessed_format()?.into_dimensions()
+    })
 }
 
 /// Why a decoder gave up.
@@ -118,7 +146,7 @@ fn undecodable(path: &Path, error: &Undecodable) -> Error {
 pub fn decode(path: &Path) -> Result<DynamicImage> {
     let mut bytes = Vec::new();
     open(path)?.take(MAX_BYTES).read_to_end(&mut bytes).map_err(|e| Error::io(path, e))?;
-    let size = dimensions(&bytes).map_err(|e| undecodable(path, &e))?;
+    let size = dimensions(Cursor::new(&bytes)).map_err(|e| undecodable(path, &e))?;
     let (width, height) = check_size(path, size)?;
     structure::check(&bytes).map_err(|fault| Error::file(path, fault))?;
     fenced(|| {
@@ -189,6 +217,62 @@ mod tests {
             let error = error.to_string();
             assert!(error.contains("huge.png") && error.contains("20000x5001"), "{error}");
         }
+    }
+
+    #[test]
+    fn a_size_is_whole_pixels_and_not_too_many() {
+        assert!(is_size(1.0, 1.0) && is_size(10_000.0, 10_000.0) && is_size(1e8, 1.0));
+        for (width, height) in
+            [(0.0, 5.0), (-3.0, -3.0), (2.5, 2.0), (16384.0, 16384.0), (f64::NAN, 1.0), (1e300, 1e300)]
+        {
+            assert!(!is_size(width, height), "{width}x{height}");
+        }
+    }
+
+    /// The chunks of a PNG: kind and data.
+    fn chunks(png: &[u8]) -> Vec<(&[u8], &[u8])> {
+        let (mut rest, mut found) = (&png[8..], Vec::new());
+        while let Some(length) = rest.first_chunk() {
+            let length = u32::from_be_bytes(*length) as usize;
+            found.push((&rest[4..8], &rest[8..8 + length]));
+            rest = &rest[12 + length..];
+        }
+        found
+    }
+
+    fn chunk(kind: &[u8], data: &[u8]) -> Vec<u8> {
+        let checked = [kind, data].concat();
+        [&(data.len() as u32).to_be_bytes()[..], &checked, &crc32fast::hash(&checked).to_be_bytes()].concat()
+    }
+
+    #[test]
+    fn a_png_with_an_enormous_colour_profile_is_read_without_it() {
+        // The pixels of a large black picture are 40 MiB of nothing, packed small.
+        let nothing = encoded(&image::GrayImage::new(6400, 6400).into(), image::ImageFormat::Png);
+        let packed: Vec<u8> =
+            chunks(&nothing).into_iter().filter(|c| c.0 == b"IDAT").flat_map(|c| c.1.to_vec()).collect();
+        assert!(packed.len() < 1_000_000, "{}", packed.len());
+        let profile = chunk(b"iCCP", &[b"p\0\0", &packed[..]].concat());
+        let plain = encoded(&six().into(), image::ImageFormat::Png);
+        let bomb = [&plain[..33], &profile, &plain[33..]].concat();
+        assert_eq!(reread("bomb.png", &bomb), six());
+        // Its size is known without what stands behind the header.
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("bomb.png");
+        fs::write(&path, [&bomb[..33], &profile].concat()).unwrap();
+        assert_eq!(check_picture(&path).unwrap(), (3, 2));
+    }
+
+    #[test]
+    fn a_png_header_that_is_damaged_is_no_header() {
+        let whole = png_header(30, 20);
+        assert_eq!(structure::png_size(&whole), Some((30, 20)));
+        for at in 12..33 {
+            let mut damaged = whole.clone();
+            damaged[at] ^= 4;
+            assert_eq!(structure::png_size(&damaged), None, "byte {at}");
+        }
+        assert_eq!(structure::png_size(&whole[..32]), None);
     }
 
     #[test]

@@ -1,17 +1,23 @@
 //! The outer structure of picture files: what a decoder would pass over in silence, or trust.
 //!
 //! A decoder that meets the end of a JPEG in the middle fills the rest with grey, and one that is told of a block of
-//! 4 GB takes memory for it. Neither needs decoding to be seen.
+//! 4 GB takes memory for it. Neither needs decoding to be seen; what a JPEG's scans lack, [`jpeg_scans`] counts.
+
+use super::jpeg_scans;
 
 /// Why a file should not be decoded: words to go on with after the file's name.
 pub(super) type Fault = &'static str;
 
 const CUT_SHORT: Fault = "is cut short: its end is missing. Copy or download it again";
 
+const SCAN_CUT_SHORT: Fault =
+    "is cut short: it has an end, but not all of the picture stands before it. Copy or download it again";
+
 /// Looks at the structure of a JPEG, PNG or WebP; nothing of a file of another kind.
 pub(super) fn check(bytes: &[u8]) -> Result<(), Fault> {
     if bytes.starts_with(b"\xff\xd8") {
-        check_jpeg(bytes)
+        check_jpeg(bytes)?;
+        if jpeg_scans::end_early(bytes) { Err(SCAN_CUT_SHORT) } else { Ok(()) }
     } else if bytes.starts_with(b"\x89PNG\r\n\x1a\n") {
         check_png(bytes)
     } else if bytes.starts_with(b"RIFF") && bytes.get(8..12) == Some(b"WEBP") {
@@ -72,6 +78,17 @@ fn check_png(bytes: &[u8]) -> Result<(), Fault> {
         at = at.saturating_add(u32::from_be_bytes([a, b, c, d]) as usize).saturating_add(12);
     }
     Err(CUT_SHORT)
+}
+
+/// How many bytes [`png_size`] looks at: the signature and the first chunk.
+pub(super) const PNG_HEADER: u64 = 33;
+
+/// Width and height of a PNG by its header, if that is whole.
+pub(super) fn png_size(bytes: &[u8]) -> Option<(u32, u32)> {
+    let chunk = bytes.strip_prefix(b"\x89PNG\r\n\x1a\n\0\0\0\x0d")?;
+    let number = |at: usize| Some(u32::from_be_bytes(*chunk.get(at..)?.first_chunk()?));
+    let header = chunk.get(..17).filter(|header| header.starts_with(b"IHDR"))?;
+    (number(17)? == crc32fast::hash(header)).then_some((number(4)?, number(8)?))
 }
 
 fn check_webp(bytes: &[u8]) -> Result<(), Fault> {
@@ -178,6 +195,10 @@ mod tests {
             for share in [0.3, 0.6, 0.9, 0.99] {
                 let cut = &bytes[..(bytes.len() as f64 * share) as usize];
                 assert!(check(cut).is_err_and(|fault| fault.contains("cut short")), "{format:?} cut at {share}");
+                if format == Jpeg && (0.5..0.95).contains(&share) {
+                    let ended = [cut, b"\xff\xd9"].concat();
+                    assert_eq!(check(&ended), Err(SCAN_CUT_SHORT), "with an end, cut at {share}");
+                }
             }
         }
     }

@@ -53,7 +53,7 @@ fn street(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + S
 
 fn folder(config: &RunConfig) -> Result<RunData> {
     let root = Path::new(&config.data);
-    let options = Options { camera: config.camera, ..Options::default() };
+    let options = Options { camera: config.camera, skip_bad_frames: config.skip_bad_frames, ..Options::default() };
     let open = |split: Option<&Path>| Kitti::open(root, split, config.height, config.width, options);
     let all: Arc<dyn Dataset> = Arc::new(open(config.split.as_deref())?);
     let (train, aside): (Arc<dyn Dataset>, Arc<dyn Dataset>) = match &config.val_split {

@@ -1,6 +1,6 @@
 //! The log of a run: a line of JSON for each logged step, and one for each validation.
 
-use std::fs::{self, File, OpenOptions};
+use std::fs::{File, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
@@ -8,6 +8,10 @@ use serde::Serialize;
 
 use crate::error::{Error, Result};
 use crate::formats::atomic::write_bytes_atomically;
+use crate::formats::bounded::read_text;
+
+/// Some million lines.
+const MAX_LOG: u64 = 1 << 30;
 
 /// `log.jsonl`, open at its end.
 pub(super) struct Log {
@@ -32,7 +36,10 @@ impl Log {
 /// Removes the lines of steps and validations after those that are known to be done: they will be logged again.
 pub(super) fn forget_after(folder: &Path, steps: u64, validated: u64) -> Result<()> {
     let path = folder.join("log.jsonl");
-    let Ok(text) = fs::read_to_string(&path) else { return Ok(()) };
+    if !path.exists() {
+        return Ok(());
+    }
+    let text = read_text(&path, MAX_LOG, "the log of a run")?;
     let keep = |line: &&str| {
         // A torn last line is none.
         let Ok(line) = serde_json::from_str::<serde_json::Value>(line) else { return false };

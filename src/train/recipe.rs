@@ -3,7 +3,6 @@
 //! What belongs to the beginning of a training (warm-up, rotations, the delay of auto-masking) is a share of its steps, so
 //! that a recipe can be given another number of steps. [`RunConfig::plan`] turns the shares into steps.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -12,6 +11,7 @@ use super::rotations::{RotationPlan, Rotations};
 use crate::data::batch::Augment;
 use crate::data::kitti::Camera;
 use crate::error::{Error, Result};
+use crate::formats::bounded::{MAX_SETTINGS, read_text};
 use crate::monovit::loss::LossConfig;
 use crate::monovit::setup::check_size;
 use crate::monovit::{Ablation, Config, Preset, Setup};
@@ -208,6 +208,9 @@ pub struct RunConfig {
     /// The camera that took a folder's pictures.
     #[serde(default)]
     pub camera: Camera,
+    /// Whether samples with a frame that cannot be read are passed over and counted; they end the run otherwise.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub skip_bad_frames: bool,
     /// Weights to start from: files or folders, all four networks together.
     #[serde(default, deserialize_with = "none_one_or_many", skip_serializing_if = "Vec::is_empty")]
     pub init: Vec<PathBuf>,
@@ -263,6 +266,7 @@ impl RunConfig {
             split: None,
             val_split: None,
             camera: Camera::Auto,
+            skip_bad_frames: false,
             init: Vec::new(),
             init_encoder: None,
             init_pose: None,
@@ -387,7 +391,7 @@ fn none_one_or_many<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result
 /// # Errors
 /// Names the file, and the line where a value cannot be used.
 pub fn read_config(path: &Path) -> Result<RunConfig> {
-    let text = fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+    let text = read_text(path, MAX_SETTINGS, "a configuration")?;
     let wrong = |e: toml::de::Error| Error::file(path, e.to_string());
     let said: toml::Table = toml::from_str(&text).map_err(wrong)?;
     let preset = said.get("preset").cloned().map_or(Ok(Preset::Nano), toml::Value::try_into).map_err(wrong)?;
@@ -436,6 +440,8 @@ fn line_of(text: &str, field: &str) -> Option<usize> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs::{self, File};
+
     use super::*;
 
     fn written(text: &str) -> Result<RunConfig> {
@@ -487,6 +493,15 @@ mod tests {
     fn what_is_written_is_read_back() {
         let config = RunConfig { split: Some("a list.txt".into()), ..RunConfig::usual() };
         assert_eq!(written(&toml::to_string(&config).unwrap()).unwrap(), config);
+    }
+
+    #[test]
+    fn a_configuration_that_is_too_long_is_not_read() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("config.toml");
+        File::create(&path).unwrap().set_len(1 << 40).unwrap();
+        let error = read_config(&path).unwrap_err().to_string();
+        assert!(error.contains("config.toml") && error.contains("a configuration of more than 1048576"), "{error}");
     }
 
     #[test]

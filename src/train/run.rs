@@ -20,7 +20,7 @@ use super::state::{self, Notes};
 use super::trainer::{StepReport, Trainer};
 pub use super::validation::{RunMetrics, Validation};
 use crate::data::Dataset;
-use crate::data::batch::Loader;
+use crate::data::batch::{Loader, SkipList};
 use crate::error::{Error, Result};
 use crate::formats::atomic::{self, check_writable, write_bytes_atomically};
 use crate::formats::safetensors;
@@ -79,6 +79,7 @@ pub struct Run {
     pub config: RunConfig,
     pub(super) trainer: Trainer,
     pub(super) notes: Notes,
+    pub(super) skipped: SkipList,
     /// Held while this process has the run.
     _lock: File,
 }
@@ -120,7 +121,14 @@ impl Run {
         }
         write_config(folder, &config)?;
         let trainer = Trainer::of(start.model, start.params, config.plan());
-        let run = Run { folder: folder.to_owned(), config, trainer, notes: Notes::default(), _lock: lock };
+        let run = Run {
+            folder: folder.to_owned(),
+            config,
+            trainer,
+            notes: Notes::default(),
+            skipped: SkipList::default(),
+            _lock: lock,
+        };
         run.save()?;
         run.leave_weights()?;
         Ok(run)
@@ -158,7 +166,7 @@ impl Run {
             write_config(folder, &config)?;
         }
         log::forget_after(folder, trainer.steps(), notes.validated)?;
-        Ok(Run { folder: folder.to_owned(), config, trainer, notes, _lock: lock })
+        Ok(Run { folder: folder.to_owned(), config, trainer, notes, skipped: SkipList::default(), _lock: lock })
     }
 
     /// Steps done.
@@ -166,12 +174,25 @@ impl Run {
         self.trainer.steps()
     }
 
+    /// The samples that were passed over because a frame of theirs could not be read.
+    pub fn skipped(&self) -> &SkipList {
+        &self.skipped
+    }
+
+    /// The list that loaders put samples on which cannot be read, if those are to be passed over.
+    pub(super) fn skip_list(&self) -> Option<SkipList> {
+        self.config.skip_bad_frames.then(|| self.skipped.clone())
+    }
+
     /// Trains to the end, or until `stop` says so.
     ///
     /// # Errors
-    /// If a step fails (numbers that are not finite, a frame that cannot be read) or the state cannot be written. The
+    /// If a step fails (numbers that are not finite, a frame that cannot be read and is not to be passed over) or the state cannot be written. The
     /// state before the failing step is kept.
     pub fn train(&mut self, data: &RunData, stop: impl Fn() -> bool, mut tell: impl FnMut(Event)) -> Result<Ended> {
+        for (name, why) in data.train.unreadable().iter().chain(data.validation.unreadable()) {
+            self.skipped.add(name, why);
+        }
         let mean_map = self.measure_beforehand(data, &mut tell);
         let validation = self.validation_batches(data, &mut tell);
         let mut log = Log::open(&self.folder)?;
@@ -183,7 +204,8 @@ impl Run {
             self.validate(data, &validation, &mut log, &mut tell)?;
         }
         let (augment, batch, seed) = (self.config.augment, self.config.batch, self.config.seed);
-        let mut loader = Loader::start(data.train.clone(), augment, batch, seed, self.trainer.steps())?;
+        let steps = self.trainer.steps();
+        let mut loader = Loader::start(data.train.clone(), augment, batch, seed, steps, self.skip_list())?;
         tell(Event::Phase("training"));
         let (mut since, mut waited, mut counted) = (Instant::now(), 0.0, 0u32);
         while self.trainer.steps() < self.config.steps {
@@ -254,7 +276,7 @@ impl Run {
         let started = Instant::now();
         let (augment, batch, seed) = (self.config.augment, self.config.batch, self.config.seed);
         // The same frames as in training, in another order.
-        let mut loader = Loader::start(data.train.clone(), augment, batch, seed ^ u64::MAX, 0)?;
+        let mut loader = Loader::start(data.train.clone(), augment, batch, seed ^ u64::MAX, 0, self.skip_list())?;
         let learnt = self.trainer.learn_rotations(
             || loader.next_batch(),
             |step, error| {

@@ -14,6 +14,7 @@ use super::trainer::Trainer;
 use crate::error::{Error, Result};
 use crate::eval::metrics::Metrics;
 use crate::formats::atomic::write_bytes_atomically;
+use crate::formats::bounded::{MAX_SETTINGS, read_text};
 use crate::formats::safetensors;
 use crate::tensor::Tensor;
 
@@ -91,7 +92,7 @@ pub(super) fn load(trainer: &mut Trainer, folder: &Path, tell: &mut impl FnMut(&
                         fs::remove_file(&state).map_err(|e| Error::io(&state, e))?;
                     }
                 }
-                let beside = fs::read_to_string(folder.join(NOTES)).ok();
+                let beside = read_text(&folder.join(NOTES), MAX_SETTINGS, "notes on a run").ok();
                 let dated = beside.and_then(|text| serde_json::from_str::<Dated>(&text).ok());
                 if let Some(dated) = dated.filter(|d| d.step == trainer.steps()) {
                     notes = dated.notes;

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::log::Log;
 use super::run::{BEST, Event, Run, RunData, load_weights, write_weights};
 use crate::data::Dataset;
-use crate::data::batch::{Augment, Batch, batch_of_step};
+use crate::data::batch::{Augment, Batch, batch_of_readable, batch_of_step};
 use crate::error::{Error, Result};
 use crate::eval::metrics::{MeanMap, Metrics, Protocol, Report, Scale};
 use crate::eval::predictor::{Evaluation, Predictor, evaluate, evaluate_mean_map};
@@ -32,6 +32,12 @@ pub struct RunMetrics {
     pub images: usize,
     /// What was compared, in words; empty if nothing was.
     pub test: String,
+    /// How many samples were passed over because a frame of theirs could not be read.
+    #[serde(default)]
+    pub skipped: usize,
+    /// The first of them, and why.
+    #[serde(default)]
+    pub first_skipped: Option<String>,
 }
 
 /// The figures of a validation, a line of the log.
@@ -62,7 +68,11 @@ impl Run {
         let plain = Augment { flip: false, jitter: false };
         let size = self.config.batch.min(data.validation.len());
         let count = data.validation.len().checked_div(size).unwrap_or(0).min(10) as u64;
-        let batches = (0..count).map(|step| batch_of_step(data.validation.as_ref(), plain, size, 0, step));
+        let samples = data.validation.as_ref();
+        let batches = (0..count).map(|step| match self.skip_list() {
+            Some(skip) => batch_of_readable(samples, plain, size, 0, step, &skip),
+            None => batch_of_step(samples, plain, size, 0, step),
+        });
         let found = told("validation data", batches.collect::<Result<Vec<_>>>(), tell).unwrap_or_default();
         if found.is_empty() {
             tell(Event::Warning("there is no validation data: the last weights will count as the best"));
@@ -154,6 +164,8 @@ impl Run {
             steps: self.trainer.steps(),
             images,
             test: first.map_or(String::new(), |first| format!("{first} and {} more", images - 1)),
+            skipped: self.skipped.count(),
+            first_skipped: self.skipped.first(),
         };
         let text = serde_json::to_string_pretty(&metrics).map_err(|e| Error::Failed(format!("the metrics: {e}")))?;
         write_bytes_atomically(self.folder.join("metrics.json"), text.as_bytes())?;

@@ -1,11 +1,12 @@
 //! The calibration of a day: `calib_cam_to_cam.txt` and `calib_velo_to_cam.txt`, lines `KEY: numbers`.
 
 use std::collections::HashMap;
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::Side;
 use crate::camera::Intrinsics;
+use crate::formats::bounded::{MAX_SETTINGS, read_text};
+use crate::formats::picture::is_size;
 use crate::{Error, Result};
 
 pub(super) const CAMERAS: &str = "calib_cam_to_cam.txt";
@@ -120,7 +121,7 @@ struct Entries {
 
 impl Entries {
     fn read(path: PathBuf) -> Result<Entries> {
-        let text = fs::read_to_string(&path).map_err(|e| Error::io(&path, e))?;
+        let text = read_text(&path, MAX_SETTINGS, "a calibration")?;
         let entry = |line: &str| line.split_once(':').map(|(k, v)| (k.trim().to_owned(), v.trim().to_owned()));
         Ok(Entries { values: text.lines().filter_map(entry).collect(), path })
     }
@@ -140,10 +141,14 @@ impl Entries {
     /// Width and height: whole numbers of pixels.
     fn size(&self, key: &str) -> Result<[f64; 2]> {
         let size: [f64; 2] = self.numbers(key)?;
-        match size.iter().all(|n| (1.0..=16384.0).contains(n) && n.fract() == 0.0) {
+        match is_size(size[0], size[1]) {
             true => Ok(size),
             false => {
-                Err(Error::file(&self.path, format!("{key}: expected width and height in pixels, found {size:?}")))
+                let message = format!(
+                    "{key}: expected width and height in pixels, at most 100 megapixels, found {size:?}; it should be \
+                     the size of this day's pictures"
+                );
+                Err(Error::file(&self.path, message))
             }
         }
     }
@@ -151,6 +156,8 @@ impl Entries {
 
 #[cfg(test)]
 mod tests {
+    use std::fs::{self, File};
+
     use super::*;
 
     const CAMERA_LINES: [&str; 5] = [
@@ -195,6 +202,8 @@ mod tests {
             (3, "P_rect_02: 1 2 3", "P_rect_02: expected 12 numbers, found 3"),
             (4, "P_rect_03: 700 0 x -339 0 710 180 2.2 0 0 1 0.003", "found \"x\""),
             (1, "S_rect_03: 0 375", "S_rect_03: expected width and height"),
+            (0, "S_rect_02: 16384 16384", "S_rect_02: expected width and height"),
+            (0, "S_rect_02: 1e8 2", "at most 100 megapixels"),
         ] {
             let mut lines = CAMERA_LINES;
             lines[i] = line;
@@ -202,6 +211,10 @@ mod tests {
             let error = Calibration::read(day.path(), false).unwrap_err().to_string();
             assert!(error.contains(CAMERAS) && error.contains(what), "{error}");
         }
+        let huge = day(&CAMERA_LINES, "");
+        File::options().write(true).open(huge.path().join(CAMERAS)).unwrap().set_len(1 << 40).unwrap();
+        let error = Calibration::read(huge.path(), false).unwrap_err().to_string();
+        assert!(error.contains(CAMERAS) && error.contains("a calibration of more than 1048576"), "{error}");
         let error = Calibration::read(day(&CAMERA_LINES, "R: 1\n").path(), true).unwrap_err().to_string();
         assert!(error.contains(LIDAR) && error.contains("R: expected 9 numbers, found 1"), "{error}");
     }

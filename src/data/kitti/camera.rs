@@ -1,6 +1,5 @@
 //! Which camera took the pictures: what the user says, a `camera.toml` among the data, the calibration, or KITTI's constants.
 
-use std::fs;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
@@ -8,6 +7,8 @@ use serde::{Deserialize, Serialize};
 use super::calibration::Calibration;
 use super::split::Side;
 use crate::camera::Intrinsics;
+use crate::formats::bounded::{MAX_SETTINGS, read_text};
+use crate::formats::picture::is_size;
 use crate::{Error, Result};
 
 /// The intrinsics that samples carry.
@@ -18,7 +19,8 @@ pub enum Camera {
     /// `calib_cam_to_cam.txt`, and, for pictures of KITTI's aspect alone, the published constants.
     #[default]
     Auto,
-    /// The constants of the published training, whatever the drive: [`Intrinsics::KITTI`].
+    /// The constants of the published training, whatever the drive: [`Intrinsics::KITTI`]. As there they hold for mirrored
+    /// pictures, too: their centre is a convention, not a measurement.
     KittiPublished,
     /// `P_rect_02` or `P_rect_03` of the day's `calib_cam_to_cam.txt`, over `S_rect`.
     Calibrated,
@@ -38,6 +40,26 @@ pub enum Camera {
         /// Vertical principal point.
         cy: f64,
     },
+}
+
+/// A camera that was found.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Found {
+    pub(super) intrinsics: Intrinsics,
+    /// Where it was found, in words.
+    pub(super) place: String,
+    /// Whether these are the published constants, and not what somebody measured.
+    pub(super) published: bool,
+}
+
+impl Found {
+    fn measured(intrinsics: Intrinsics, place: impl Into<String>) -> Found {
+        Found { intrinsics, place: place.into(), published: false }
+    }
+
+    fn published(place: impl Into<String>) -> Found {
+        Found { intrinsics: Intrinsics::KITTI, place: place.into(), published: true }
+    }
 }
 
 /// Width over height of KITTI's pictures.
@@ -65,36 +87,30 @@ impl Camera {
     ///
     /// # Errors
     /// If nothing is known of the camera, or what is said cannot be.
-    pub(super) fn resolve(
-        self,
-        root: &Path,
-        drive: &Path,
-        side: Side,
-        (width, height): (u32, u32),
-    ) -> Result<(Intrinsics, String)> {
+    pub(super) fn resolve(self, root: &Path, drive: &Path, side: Side, (width, height): (u32, u32)) -> Result<Found> {
         let size = [f64::from(width), f64::from(height)];
         let day = drive.parent().unwrap_or(drive);
         match self {
-            Camera::KittiPublished => Ok((Intrinsics::KITTI, "KITTI's published constants".into())),
+            Camera::KittiPublished => Ok(Found::published("KITTI's published constants")),
             Camera::Calibrated => calibrated(day, side),
             Camera::Fov { degrees } => {
                 let found = of_fov(degrees, size).map_err(|why| Error::setting("camera.degrees", why))?;
-                Ok((found, format!("a field of view of {degrees} degrees")))
+                Ok(Found::measured(found, format!("a field of view of {degrees} degrees")))
             }
             Camera::Pixels { fx, fy, cx, cy } => {
                 let found = of_pixels([fx, fy, cx, cy], size).map_err(|why| Error::setting("camera", why))?;
-                Ok((found, "the intrinsics that were given".into()))
+                Ok(Found::measured(found, "the intrinsics that were given"))
             }
             Camera::Auto => {
                 let above = drive.ancestors().take_while(|folder| folder.starts_with(root));
                 if let Some(file) = above.map(|folder| folder.join(FILE)).find(|file| file.is_file()) {
-                    return Ok((read(&file, size)?, file.display().to_string()));
+                    return Ok(Found::measured(read(&file, size)?, file.display().to_string()));
                 }
                 if Calibration::has_cameras(day) {
                     return calibrated(day, side);
                 }
                 if ((size[0] / size[1]) / KITTI_ASPECT - 1.0).abs() < 0.1 {
-                    return Ok((Intrinsics::KITTI, "KITTI's published constants, for want of a calibration".into()));
+                    return Ok(Found::published("KITTI's published constants, for want of a calibration"));
                 }
                 let message = format!(
                     "nothing says which camera took these pictures of {width}x{height}: write {FILE} into this folder or \
@@ -107,14 +123,14 @@ impl Camera {
     }
 }
 
-fn calibrated(day: &Path, side: Side) -> Result<(Intrinsics, String)> {
+fn calibrated(day: &Path, side: Side) -> Result<Found> {
     let found = Calibration::intrinsics_of(day, side)?;
-    Ok((found, day.join(super::calibration::CAMERAS).display().to_string()))
+    Ok(Found::measured(found, day.join(super::calibration::CAMERAS).display().to_string()))
 }
 
 /// Reads `camera.toml`, for pictures of a size.
 fn read(path: &Path, size: [f64; 2]) -> Result<Intrinsics> {
-    let text = fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+    let text = read_text(path, MAX_SETTINGS, "a camera")?;
     let said: CameraFile = toml::from_str(&text).map_err(|e| Error::file(path, e.to_string()))?;
     let found = match said {
         CameraFile { fov: Some(fov), fx: None, fy: None, cx: None, cy: None, .. } => of_fov(fov, size),
@@ -127,7 +143,9 @@ fn read(path: &Path, size: [f64; 2]) -> Result<Intrinsics> {
             cy: Some(cy),
             fov: None,
         } => {
-            if ((w / h) / (size[0] / size[1]) - 1.0).abs() > 0.02 {
+            if !is_size(w, h) {
+                Err(format!("is for pictures of {w}x{h}: expected whole pixels, at most 100 megapixels"))
+            } else if ((w / h) / (size[0] / size[1]) - 1.0).abs() > 0.02 {
                 Err(format!("is for pictures of {w}x{h}, but these have {}x{}: another aspect", size[0], size[1]))
             } else {
                 of_pixels([fx, fy, cx, cy], [w, h])
@@ -160,19 +178,25 @@ fn of_pixels([fx, fy, cx, cy]: [f64; 4], [width, height]: [f64; 2]) -> Result<In
 
 #[cfg(test)]
 mod tests {
+    use std::fs::{self, File};
+
     use super::*;
 
     const SIZE: (u32, u32) = (800, 600);
 
     /// What a drive's camera is found to be, with a `camera.toml` in the drive's folder.
     fn found(text: Option<&str>, camera: Camera) -> Result<(Intrinsics, String)> {
+        resolved(text, camera, SIZE).map(|found| (found.intrinsics, found.place))
+    }
+
+    fn resolved(text: Option<&str>, camera: Camera, size: (u32, u32)) -> Result<Found> {
         let place = tempfile::tempdir().unwrap();
         let drive = place.path().join("day/drive");
         fs::create_dir_all(&drive).unwrap();
         if let Some(text) = text {
             fs::write(drive.join(FILE), text).unwrap();
         }
-        camera.resolve(place.path(), &drive, Side::Left, SIZE)
+        camera.resolve(place.path(), &drive, Side::Left, size)
     }
 
     #[test]
@@ -198,6 +222,26 @@ mod tests {
     }
 
     #[test]
+    fn a_camera_file_that_is_too_long_is_not_read() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join(FILE);
+        File::create(&path).unwrap().set_len(1 << 40).unwrap();
+        let error = read(&path, [800.0, 600.0]).unwrap_err().to_string();
+        assert!(error.contains(FILE) && error.contains("a camera of more than 1048576"), "{error}");
+    }
+
+    #[test]
+    fn only_the_published_constants_by_name_count_as_published() {
+        let kitti = (1242, 375);
+        let published = |text, camera| resolved(text, camera, kitti).unwrap().published;
+        assert!(published(None, Camera::Auto) && published(Some("fov = 90"), Camera::KittiPublished));
+        // The same numbers, measured.
+        let [fx, fy, cx, cy] = [0.58 * 1242.0, 1.92 * 375.0, 621.0, 187.5];
+        assert!(!published(None, Camera::Pixels { fx, fy, cx, cy }));
+        assert!(!published(Some("fov = 90"), Camera::Auto) && !published(None, Camera::Fov { degrees: 80.0 }));
+    }
+
+    #[test]
     fn a_camera_that_cannot_be_is_refused_by_file() {
         for text in [
             "",
@@ -211,6 +255,10 @@ mod tests {
             "width = 800\nheight = 600\nfx = 500\nfy = 500\ncx = 900\ncy = 300",
             "width = 800\nheight = 300\nfx = 500\nfy = 500\ncx = 400\ncy = 200",
             "focal = 3",
+            // Sizes that no picture has.
+            "width = 1e9\nheight = 7.5e8\nfx = 500\nfy = 500\ncx = 400\ncy = 300",
+            "width = 800.5\nheight = 600.375\nfx = 500\nfy = 500\ncx = 400\ncy = 300",
+            "width = nan\nheight = nan\nfx = 500\nfy = 500\ncx = 400\ncy = 300",
         ] {
             let error = found(Some(text), Camera::Auto).unwrap_err().to_string();
             assert!(error.contains(FILE), "{text}: {error}");

@@ -4,6 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use crate::depth::DepthMap;
+use crate::formats::bounded::read_bounded;
 use crate::{Error, Result};
 
 /// What a point's depth is.
@@ -19,6 +20,9 @@ pub enum DepthAxis {
 /// Bytes of a point: x, y, z (metres; forward, left, up) and reflectance, little-endian f32.
 const POINT: usize = 16;
 
+/// The most bytes of a scan: four million points, thirty times as many as one turn of KITTI's LiDAR sees.
+const MAX_SCAN: u64 = 64 << 20;
+
 /// A scan's file is whole points.
 pub fn check_scan(path: &Path) -> Result<()> {
     let length = fs::metadata(path).map_err(|e| Error::io(path, e))?.len();
@@ -26,6 +30,10 @@ pub fn check_scan(path: &Path) -> Result<()> {
 }
 
 fn check_length(path: &Path, length: u64) -> Result<()> {
+    if length > MAX_SCAN {
+        let message = format!("{length} bytes: LiDAR scans above {MAX_SCAN} are refused; check that this is one turn");
+        return Err(Error::file(path, message));
+    }
     if length == 0 || !length.is_multiple_of(POINT as u64) {
         let message = format!("expected a LiDAR scan of {POINT} bytes a point, found {length} bytes: the file is cut");
         return Err(Error::file(path, message));
@@ -35,7 +43,7 @@ fn check_length(path: &Path, length: u64) -> Result<()> {
 
 /// The points of a scan, x, y and z in metres.
 pub fn read_scan(path: &Path) -> Result<Vec<[f32; 3]>> {
-    let bytes = fs::read(path).map_err(|e| Error::io(path, e))?;
+    let bytes = read_bounded(path, MAX_SCAN, "a LiDAR scan")?;
     check_length(path, bytes.len() as u64)?;
     let points = bytes.as_chunks::<POINT>().0.iter();
     Ok(points
@@ -56,7 +64,7 @@ pub fn project_scan(
     height: usize,
     axis: DepthAxis,
 ) -> DepthMap {
-    let mut nearest = vec![f64::INFINITY; width * height];
+    let mut metres = vec![f32::INFINITY; width * height];
     for point in points.iter().filter(|point| point[0] >= 0.0) {
         let [x, y, z] = point.map(f64::from);
         let rows = lidar_to_image.as_chunks::<4>().0;
@@ -69,11 +77,13 @@ pub fn project_scan(
                 DepthAxis::CameraZ => camera_z,
                 DepthAxis::LidarX => x,
             };
-            let pixel = &mut nearest[line as usize * width + column as usize];
-            *pixel = pixel.min(depth);
+            let pixel = &mut metres[line as usize * width + column as usize];
+            *pixel = pixel.min(depth as f32);
         }
     }
-    let metres = nearest.iter().map(|&d| if d > 0.0 && d.is_finite() { d as f32 } else { 0.0 }).collect();
+    for depth in &mut metres {
+        *depth = if *depth > 0.0 && depth.is_finite() { *depth } else { 0.0 };
+    }
     DepthMap { width, height, metres }
 }
 
@@ -125,6 +135,11 @@ mod tests {
         fs::write(&path, [0; 40]).unwrap();
         for error in [check_scan(&path).unwrap_err(), read_scan(&path).unwrap_err()] {
             assert!(error.to_string().contains("scan.bin") && error.to_string().contains("40 bytes"), "{error}");
+        }
+        std::fs::File::create(&path).unwrap().set_len(1 << 40).unwrap();
+        for error in [check_scan(&path).unwrap_err(), read_scan(&path).unwrap_err()] {
+            let error = error.to_string();
+            assert!(error.contains("scan.bin") && error.contains("67108864"), "{error}");
         }
         fs::write(&path, [1.5f32, -2.0, 0.25, 0.5].map(f32::to_le_bytes).as_flattened()).unwrap();
         assert_eq!(read_scan(&path).unwrap(), [[1.5, -2.0, 0.25]]);

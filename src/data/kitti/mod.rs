@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! ROOT/DATE/calib_cam_to_cam.txt, calib_velo_to_cam.txt
-//! ROOT/DATE/DRIVE/image_02/data/0000000005.png (or .jpg); image_03 is the right camera
+//! ROOT/DATE/DRIVE/image_02/data/0000000005.png (or .jpg, .jpeg, .webp); image_03 is the right camera
 //! ROOT/DATE/DRIVE/proj_depth/groundtruth/image_02/0000000005.png
 //! ROOT/DATE/DRIVE/velodyne_points/data/0000000005.bin
 //! ```
@@ -28,6 +28,7 @@ pub use lidar::{DepthAxis, project_scan, read_scan};
 pub use split::{Side, SplitLine, read_split};
 
 use super::Dataset;
+use super::augment::flip_intrinsics;
 use super::resize::lanczos;
 use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
@@ -48,6 +49,17 @@ pub enum GroundTruth {
     Off,
 }
 
+impl GroundTruth {
+    fn name(self) -> &'static str {
+        match self {
+            GroundTruth::Auto => "any ground truth",
+            GroundTruth::Improved => "the improved ground truth",
+            GroundTruth::Lidar(_) => "the LiDAR scan",
+            GroundTruth::Off => "no ground truth",
+        }
+    }
+}
+
 /// How a data set is opened.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Options {
@@ -59,6 +71,8 @@ pub struct Options {
     pub camera: Camera,
     /// Which depth.
     pub ground_truth: GroundTruth,
+    /// Whether samples are left out whose pictures cannot be read, by their headers; otherwise they are an error.
+    pub skip_bad_frames: bool,
     /// How many bytes of resized pictures are kept in memory; beyond them frames are decoded each time.
     pub cache_bytes: usize,
 }
@@ -71,6 +85,7 @@ impl Default for Options {
             stereo: false,
             camera: Camera::Auto,
             ground_truth: GroundTruth::Auto,
+            skip_bad_frames: false,
             cache_bytes: 1 << 30,
         }
     }
@@ -96,16 +111,28 @@ struct Drive {
     /// As in split lists, `DATE/DRIVE`.
     folder: String,
     path: PathBuf,
+    /// The frames that are there, left and right: number and file name.
+    frames: [BTreeMap<u32, String>; 2],
     /// The calibration of its day, where something needs it.
     calibration: Option<Arc<Calibration>>,
 }
 
 impl Drive {
-    /// The file of a frame, PNG before JPEG; the PNG's path as the error where neither is there.
+    /// The frames of a camera: number and file name.
+    fn frames(&self, side: Side) -> &BTreeMap<u32, String> {
+        match side {
+            Side::Left => &self.frames[0],
+            Side::Right => &self.frames[1],
+        }
+    }
+
+    /// The file of a frame; where there is none, the path as a PNG as the error.
     fn picture(&self, number: u32, side: Side) -> Result<PathBuf, PathBuf> {
         let folder = self.path.join(side.folder()).join("data");
-        let with = |extension: &str| folder.join(format!("{number:010}.{extension}"));
-        ["png", "jpg"].into_iter().map(with).find(|path| path.is_file()).ok_or_else(|| with("png"))
+        match self.frames(side).get(&number) {
+            Some(name) => Ok(folder.join(name)),
+            None => Err(folder.join(format!("{number:010}.png"))),
+        }
     }
 
     fn depth_png(&self, frame: Frame) -> PathBuf {
@@ -137,9 +164,22 @@ pub struct Kitti {
     height: u32,
     width: u32,
     options: Options,
-    /// Of each drive and side: the intrinsics, and where they were found.
-    cameras: BTreeMap<(usize, Side), (Intrinsics, String)>,
+    /// Of each drive and side.
+    cameras: BTreeMap<(usize, Side), camera::Found>,
+    left_out: LeftOut,
+    unreadable: Vec<(String, String)>,
     cache: Mutex<Cache>,
+}
+
+/// Frames of a folder that are no samples.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct LeftOut {
+    /// How many lack a neighbour or the other camera's frame, which were asked for.
+    pub without_pictures: usize,
+    /// How many have all pictures and lack the ground truth that was asked for.
+    pub without_depth: usize,
+    /// Where the first one's ground truth was looked for.
+    pub first_depth: Option<PathBuf>,
 }
 
 impl Kitti {
@@ -161,6 +201,8 @@ impl Kitti {
             width: side_of_picture("width", width)?,
             options,
             cameras: BTreeMap::new(),
+            left_out: LeftOut::default(),
+            unreadable: Vec::new(),
             cache: Mutex::default(),
         };
         match split {
@@ -193,6 +235,7 @@ impl Kitti {
         if lines.is_empty() {
             return Err(Error::file(split, "no samples: every line is blank; expected lines FOLDER FRAME SIDE"));
         }
+        let mut lacking = None;
         for line in lines {
             let at = |message: String| Error::file(split, format!("line {}: {message}", line.number));
             let drive = match drives.get(&line.folder) {
@@ -208,10 +251,39 @@ impl Kitti {
                 }
             };
             let frame = Frame { drive, number: line.frame, side: line.side };
-            self.check_sample(frame, &mut checked).map_err(|e| at(e.to_string()))?;
+            if let Err(error) = self.check_pictures(frame, &mut checked) {
+                // That a frame is not there is a fault of the list.
+                if !(self.options.skip_bad_frames && self.has_pictures(frame)) {
+                    return Err(at(error.to_string()));
+                }
+                self.unreadable.push((self.name_of(frame), error.to_string()));
+                continue;
+            }
+            if let Some(missing) = self.missing_truth(frame) {
+                // The others are counted before this is reported.
+                lacking.get_or_insert((line.number, missing));
+                self.left_out.without_depth += 1;
+                continue;
+            }
+            self.check_truth(frame).map_err(|e| at(e.to_string()))?;
             self.samples.push(frame);
         }
-        Ok(())
+        let Some((number, missing)) = lacking else {
+            return match (self.samples.is_empty(), self.unreadable.first()) {
+                (true, Some((_, why))) => {
+                    Err(Error::file(split, format!("no frame of it can be read; the first: {why}")))
+                }
+                _ => Ok(()),
+            };
+        };
+        let (what, without) = (self.options.ground_truth.name(), self.left_out.without_depth);
+        let message = format!(
+            "line {number}: {}: {what} of this frame is missing ({without} of the list's {} frames lack it); use a list \
+             of the frames that have it",
+            missing.display(),
+            self.samples.len() + without
+        );
+        Err(Error::file(split, message))
     }
 
     fn take_everything(&mut self, root: &Path) -> Result<()> {
@@ -221,28 +293,76 @@ impl Kitti {
             self.add_drive(&folder, path, &mut days)?;
             let drive = self.drives.len() - 1;
             for side in [Side::Left, Side::Right] {
-                for number in scan::frames(&self.drives[drive].path.join(side.folder()).join("data"))? {
+                let numbers: Vec<u32> = self.drives[drive].frames(side).keys().copied().collect();
+                for number in numbers {
                     let frame = Frame { drive, number, side };
-                    if self.has_all(frame) {
-                        self.check_sample(frame, &mut checked)?;
+                    if !self.has_pictures(frame) {
+                        self.left_out.without_pictures += 1;
+                    } else if let Some(missing) = self.missing_truth(frame) {
+                        self.left_out.without_depth += 1;
+                        self.left_out.first_depth.get_or_insert(missing);
+                    } else {
+                        if let Err(error) = self.check_pictures(frame, &mut checked) {
+                            if !self.options.skip_bad_frames {
+                                return Err(error);
+                            }
+                            self.unreadable.push((self.name_of(frame), error.to_string()));
+                            continue;
+                        }
+                        self.check_truth(frame)?;
                         self.samples.push(frame);
                     }
                 }
             }
         }
         if self.samples.is_empty() {
-            let wanted = if self.options.neighbours { " with both neighbours" } else { "" };
-            let message = format!(
-                "no frames{wanted} found in the layout of KITTI raw; expected files like \
-                 DATE/DRIVE/image_02/data/0000000000.png"
-            );
-            return Err(Error::file(root, message));
+            return Err(Error::file(root, self.why_nothing()));
         }
         Ok(())
     }
 
+    /// Why no frame that was looked for is a sample.
+    fn why_nothing(&self) -> String {
+        let wanted = match (self.options.neighbours, self.options.stereo) {
+            (true, true) => " with both neighbours and the other camera's frame",
+            (true, false) => " with both neighbours",
+            (false, true) => " with the other camera's frame",
+            (false, false) => "",
+        };
+        if let Some((_, why)) = self.unreadable.first() {
+            return format!("none of {} frames{wanted} can be read; the first: {why}", self.unreadable.len());
+        }
+        let LeftOut { without_pictures, without_depth, first_depth } = &self.left_out;
+        match (without_pictures, first_depth) {
+            (0, None) => format!(
+                "no frames{wanted} found in the layout of KITTI raw; expected files like \
+                 DATE/DRIVE/image_02/data/0000000000.png"
+            ),
+            (without, None) => format!("no frames{wanted} found: all {without} frames that are there lack one"),
+            (without, Some(path)) => {
+                let others = match without {
+                    0 => String::new(),
+                    n => format!(", and {n} more lack a neighbour or the other camera's frame"),
+                };
+                format!(
+                    "there are frames, but no ground-truth depth: {without_depth} frames lack it{others}; {} was looked \
+                     for where the first one's should be, {}",
+                    self.options.ground_truth.name(),
+                    path.display()
+                )
+            }
+        }
+    }
+
+    /// The frames that are there and are no samples, because something that was asked for is missing; of a list, none.
+    pub fn left_out(&self) -> &LeftOut {
+        &self.left_out
+    }
+
     fn add_drive(&mut self, folder: &str, path: PathBuf, days: &mut HashMap<PathBuf, Arc<Calibration>>) -> Result<()> {
-        let mut drive = Drive { folder: folder.to_owned(), path, calibration: None };
+        let frames = |side: Side| scan::frames(&path.join(side.folder()).join("data"));
+        let frames = [frames(Side::Left)?, frames(Side::Right)?];
+        let mut drive = Drive { folder: folder.to_owned(), path, frames, calibration: None };
         let day = drive.day().to_owned();
         let with_lidar = match self.options.ground_truth {
             GroundTruth::Lidar(_) => true,
@@ -267,20 +387,25 @@ impl Kitti {
         offsets.iter().map(move |&offset| frame.at(offset)).chain(self.options.stereo.then_some(Some(other)))
     }
 
-    /// Whether a frame that was found, not listed, is a sample: everything it needs is there.
-    fn has_all(&self, frame: Frame) -> bool {
+    /// Whether all pictures are there that a sample needs.
+    fn has_pictures(&self, frame: Frame) -> bool {
         let drive = &self.drives[frame.drive];
-        let pictures = self.needed(frame).all(|f| f.is_some_and(|f| drive.picture(f.number, f.side).is_ok()));
-        pictures
-            && match self.options.ground_truth {
-                GroundTruth::Improved => drive.depth_png(frame).is_file(),
-                GroundTruth::Lidar(_) => drive.scan(frame).is_file(),
-                GroundTruth::Auto | GroundTruth::Off => true,
-            }
+        self.needed(frame).all(|f| f.is_some_and(|f| drive.picture(f.number, f.side).is_ok()))
     }
 
-    /// Checks all that a sample needs; `checked` remembers the pictures that several samples share.
-    fn check_sample(&self, frame: Frame, checked: &mut HashSet<Frame>) -> Result<()> {
+    /// The file of the ground truth that a sample needs, if it is not there.
+    fn missing_truth(&self, frame: Frame) -> Option<PathBuf> {
+        let drive = &self.drives[frame.drive];
+        let file = match self.options.ground_truth {
+            GroundTruth::Improved => drive.depth_png(frame),
+            GroundTruth::Lidar(_) => drive.scan(frame),
+            GroundTruth::Auto | GroundTruth::Off => return None,
+        };
+        (!file.is_file()).then_some(file)
+    }
+
+    /// Checks the pictures that a sample needs; `checked` remembers those that several samples share.
+    fn check_pictures(&self, frame: Frame, checked: &mut HashSet<Frame>) -> Result<()> {
         let drive = &self.drives[frame.drive];
         for needed in self.needed(frame) {
             let Some(needed) = needed else {
@@ -292,14 +417,22 @@ impl Kitti {
                 checked.insert(needed);
             }
         }
-        match self.options.ground_truth {
-            GroundTruth::Improved => {
-                check_picture(&present(drive.depth_png(frame), "improved ground truth")?)?;
-            }
-            GroundTruth::Lidar(_) => lidar::check_scan(&present(drive.scan(frame), "LiDAR scan")?)?,
-            GroundTruth::Auto | GroundTruth::Off => {}
-        }
         Ok(())
+    }
+
+    /// Checks the file of a sample's ground truth, which is there.
+    fn check_truth(&self, frame: Frame) -> Result<()> {
+        let drive = &self.drives[frame.drive];
+        match self.options.ground_truth {
+            GroundTruth::Improved => check_picture(&drive.depth_png(frame)).map(drop),
+            GroundTruth::Lidar(_) => lidar::check_scan(&drive.scan(frame)),
+            GroundTruth::Auto | GroundTruth::Off => Ok(()),
+        }
+    }
+
+    /// As the line of a split list: `FOLDER FRAME SIDE`.
+    fn name_of(&self, frame: Frame) -> String {
+        format!("{} {} {}", self.drives[frame.drive].folder, frame.number, frame.side.letter())
     }
 
     /// The file of `frame`; where there is none the message says what it is to `target`.
@@ -312,7 +445,7 @@ impl Kitti {
                 1 => format!("the frame after frame {}", target.number),
                 offset => format!("the frame at {offset:+} of frame {}", target.number),
             };
-            let message = format!("{what} is missing; expected this file or the same as .jpg");
+            let message = format!("{what} is missing; expected this file, or the same as .jpg, .jpeg or .webp");
             Error::file(expected, message)
         })
     }
@@ -328,6 +461,11 @@ impl Kitti {
             let message = format!("frame {} has no frame at {offset:+}", target.number);
             Error::file(&self.drives[target.drive].path, message)
         })
+    }
+
+    fn camera(&self, sample: usize) -> &camera::Found {
+        let frame = self.samples[sample];
+        &self.cameras[&(frame.drive, frame.side)]
     }
 
     /// Which camera a sample was taken with.
@@ -382,10 +520,12 @@ impl Dataset for Kitti {
         self.samples.len()
     }
 
-    /// As the line of a split list: `FOLDER FRAME SIDE`.
     fn name(&self, sample: usize) -> String {
-        let frame = self.samples[sample];
-        format!("{} {} {}", self.drives[frame.drive].folder, frame.number, frame.side.letter())
+        self.name_of(self.samples[sample])
+    }
+
+    fn unreadable(&self) -> &[(String, String)] {
+        &self.unreadable
     }
 
     fn image(&self, sample: usize, offset: i32) -> Result<Arc<RgbImage>> {
@@ -394,13 +534,18 @@ impl Dataset for Kitti {
     }
 
     fn intrinsics(&self, sample: usize) -> Intrinsics {
-        let frame = self.samples[sample];
-        self.cameras[&(frame.drive, frame.side)].0
+        self.camera(sample).intrinsics
+    }
+
+    /// The published constants stay as they are, as in the published training.
+    fn mirrored_intrinsics(&self, sample: usize, width: usize) -> Intrinsics {
+        let camera = self.camera(sample);
+        if camera.published { camera.intrinsics } else { flip_intrinsics(camera.intrinsics, width) }
     }
 
     fn cameras(&self) -> Vec<String> {
         let mut said: Vec<String> = Vec::new();
-        for (k, place) in self.cameras.values() {
+        for camera::Found { intrinsics: k, place, .. } in self.cameras.values() {
             let line = format!("fx {:.4}, fy {:.4}, cx {:.4}, cy {:.4} of the size: {place}", k.fx, k.fy, k.cx, k.cy);
             if !said.contains(&line) {
                 said.push(line);
@@ -424,14 +569,6 @@ impl Dataset for Kitti {
             GroundTruth::Auto | GroundTruth::Off => Ok(None),
         }
     }
-}
-
-fn present(path: PathBuf, what: &str) -> Result<PathBuf> {
-    if path.is_file() {
-        return Ok(path);
-    }
-    let message = format!("the {what} of this frame is missing; use a list of the frames that have it");
-    Err(Error::file(path, message))
 }
 
 fn side_of_picture(name: &str, size: usize) -> Result<u32> {

@@ -1,9 +1,10 @@
 //! Finds drives and frames where no list names them.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use crate::data::inputs::ENDINGS;
 use crate::{Error, Result};
 
 /// Drives lie at most this many folders below the root: `DATE/DRIVE`.
@@ -33,17 +34,32 @@ fn visit(folder: &Path, name: &str, depth: usize, found: &mut Vec<(String, PathB
     Ok(())
 }
 
-/// The numbers of the frames in a camera's `data` folder, in order; none if the folder is not there. Files that are
-/// not named ten digits and `.png` or `.jpg` are something else.
-pub fn frames(folder: &Path) -> Result<BTreeSet<u32>> {
+/// The frames in a camera's `data` folder, number and file name, in order; none if the folder is not there. Files that are
+/// not named ten digits and the ending of a picture, in capitals or not, are something else. Of a frame that is there
+/// more than once the first in the order of [`ENDINGS`] counts.
+pub fn frames(folder: &Path) -> Result<BTreeMap<u32, String>> {
+    let mut found: BTreeMap<u32, (usize, String)> = BTreeMap::new();
     if !folder.is_dir() {
-        return Ok(BTreeSet::new());
+        return Ok(BTreeMap::new());
     }
-    let number = |name: String| {
-        let (stem, extension) = name.rsplit_once('.')?;
-        (stem.len() == 10 && ["png", "jpg"].contains(&extension)).then(|| stem.parse().ok())?
-    };
-    Ok(entries(folder)?.filter_map(number).collect())
+    for name in entries(folder)? {
+        let Some((number, ending)) = numbered(&name) else { continue };
+        let this = (ending, name);
+        match found.get(&number) {
+            Some(other) if *other <= this => {}
+            _ if folder.join(&this.1).is_file() => drop(found.insert(number, this)),
+            _ => {}
+        }
+    }
+    Ok(found.into_iter().map(|(number, (_, name))| (number, name)).collect())
+}
+
+/// A frame's number, and the index of its ending.
+fn numbered(name: &str) -> Option<(u32, usize)> {
+    let (stem, ending) = name.rsplit_once('.')?;
+    let ending = ENDINGS.iter().position(|known| ending.eq_ignore_ascii_case(known))?;
+    let digits = stem.len() == 10 && stem.bytes().all(|b| b.is_ascii_digit());
+    Some((digits.then(|| stem.parse().ok())??, ending))
 }
 
 /// The names in a folder; those that are not Unicode cannot be KITTI's.
@@ -69,8 +85,22 @@ mod tests {
         }
         let names: Vec<String> = drives(root.path()).unwrap().into_iter().map(|(name, _)| name).collect();
         assert_eq!(names, ["day/a", "day/b"]);
-        assert_eq!(frames(&data).unwrap().into_iter().collect::<Vec<_>>(), [2, 10]);
+        assert_eq!(frames(&data).unwrap().into_keys().collect::<Vec<_>>(), [2, 10]);
         assert!(frames(&root.path().join("nowhere")).unwrap().is_empty());
+    }
+
+    #[test]
+    fn frames_have_every_ending_that_pictures_have() {
+        let data = tempfile::tempdir().unwrap();
+        let names = ["0000000001.jpeg", "0000000002.JPG", "0000000003.webp", "0000000004.PNG", "0000000005.WebP"];
+        let others = ["0000000002.webp", "0000000006.gif", "+000000007.png", "0000000003.JPeG", "0000000009"];
+        for name in names.iter().chain(&others) {
+            fs::write(data.path().join(name), b"").unwrap();
+        }
+        fs::create_dir(data.path().join("0000000008.png")).unwrap();
+        let found: Vec<(u32, String)> = frames(data.path()).unwrap().into_iter().collect();
+        let expected = [(1, names[0]), (2, names[1]), (3, "0000000003.JPeG"), (4, names[3]), (5, names[4])];
+        assert_eq!(found, expected.map(|(number, name)| (number, name.to_owned())));
     }
 
     #[test]

@@ -1,8 +1,8 @@
 //! Split lists: which frames belong to a part of the data.
 
-use std::fs;
 use std::path::{Component, Path};
 
+use crate::formats::bounded::read_text;
 use crate::{Error, Result};
 
 /// Which of the two colour cameras.
@@ -40,12 +40,15 @@ impl Side {
     }
 }
 
+/// A list of a million frames has fewer bytes.
+const MAX_LIST: u64 = 64 << 20;
+
 /// A line of a split list.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SplitLine {
     /// The number of the line, from 1.
     pub number: usize,
-    /// The drive, `DATE/DRIVE`.
+    /// The drive, `DATE/DRIVE`, however it is spelled: `./DATE//DRIVE/` is the same.
     pub folder: String,
     /// The target frame.
     pub frame: u32,
@@ -59,7 +62,7 @@ pub struct SplitLine {
 /// # Errors
 /// For the first line that is something else, with the file and the number of the line.
 pub fn read_split(path: &Path) -> Result<Vec<SplitLine>> {
-    let text = fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+    let text = read_text(path, MAX_LIST, "a split list")?;
     let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
     let lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
     lines
@@ -77,9 +80,7 @@ fn parse(number: usize, line: &str) -> Result<SplitLine, String> {
     let &[folder, frame, side] = fields.as_slice() else {
         return Err(format!("found {} fields", fields.len()));
     };
-    if !Path::new(folder).components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir)) {
-        return Err("with a folder inside the data set's".to_owned());
-    }
+    let folder = spelled(folder).ok_or_else(|| "with a folder inside the data set's".to_owned())?;
     // Ten digits are the most a file name has.
     let frame = frame.parse().map_err(|_| format!("with a frame number like 5 or 0000000005, found {frame:?}"))?;
     let side = match side {
@@ -89,11 +90,26 @@ fn parse(number: usize, line: &str) -> Result<SplitLine, String> {
             return Err(format!("with the side l (image_02) or r (image_03), found {side:?}"));
         }
     };
-    Ok(SplitLine { number, folder: folder.to_owned(), frame, side })
+    Ok(SplitLine { number, folder, frame, side })
+}
+
+/// The one spelling of a path that stays inside the folder that it starts from.
+fn spelled(folder: &str) -> Option<String> {
+    let mut names = Vec::new();
+    for component in Path::new(folder).components() {
+        match component {
+            Component::Normal(name) => names.push(name.to_str()?),
+            Component::CurDir => {}
+            _ => return None,
+        }
+    }
+    Some(if names.is_empty() { ".".to_owned() } else { names.join("/") })
 }
 
 #[cfg(test)]
 mod tests {
+    use std::fs::{self, File};
+
     use super::*;
 
     fn read(text: &str) -> Result<Vec<SplitLine>> {
@@ -112,6 +128,14 @@ mod tests {
     }
 
     #[test]
+    fn spellings_of_a_folder_are_one_folder() {
+        let lines = read("a/b 3 l\n./a/b 3 l\na//b/ 0000000003 l\na/./b 3 l\n././ 3 l\n. 3 l").unwrap();
+        let folders: Vec<&str> = lines.iter().map(|line| line.folder.as_str()).collect();
+        assert_eq!(folders, ["a/b", "a/b", "a/b", "a/b", ".", "."]);
+        assert!(lines.iter().all(|line| line.frame == 3));
+    }
+
+    #[test]
     fn every_bad_line_names_file_and_line() {
         for (text, what) in [
             ("a/b 5 l\n\na/b 5", "found 2 fields"),
@@ -126,6 +150,15 @@ mod tests {
             let error = read(text).unwrap_err().to_string();
             assert!(error.contains("split.txt: line 3: ") && error.contains(what), "{error}");
         }
+    }
+
+    #[test]
+    fn a_list_that_is_too_long_is_not_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("split.txt");
+        File::create(&path).unwrap().set_len(1 << 40).unwrap();
+        let error = read_split(&path).unwrap_err().to_string();
+        assert!(error.contains("split.txt") && error.contains("a split list of more than 67108864"), "{error}");
     }
 
     #[test]

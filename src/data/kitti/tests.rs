@@ -48,6 +48,7 @@ const TARGET_ONLY: Options = Options {
     stereo: false,
     camera: Camera::KittiPublished,
     ground_truth: GroundTruth::Auto,
+    skip_bad_frames: false,
     cache_bytes: 0,
 };
 
@@ -140,6 +141,27 @@ fn what_cannot_be_used_is_found_at_opening() {
 }
 
 #[test]
+fn frames_that_cannot_be_read_are_left_out_if_they_may_be() {
+    let root = made_up(3..9);
+    fs::write(root.path().join("day/drive/image_02/data/0000000008.png"), b"not a picture").unwrap();
+    let skipping = Options { skip_bad_frames: true, ..PUBLISHED };
+    let list = "day/drive 4 l\nday/drive 7 l\nday/drive 7 r";
+    for (lines, expected) in [(Some(list), 2), (None, 7)] {
+        assert!(message(open(root.path(), lines, PUBLISHED)).contains("0000000008.png"));
+        let kitti = open(root.path(), lines, skipping).unwrap();
+        assert_eq!(kitti.len(), expected);
+        let [(name, why)] = kitti.unreadable() else { panic!("{:?}", kitti.unreadable()) };
+        assert!(name == "day/drive 7 l" && why.contains("0000000008.png") && why.contains("decode"), "{name}: {why}");
+    }
+    let error = message(open(root.path(), Some("day/drive 7 l"), skipping));
+    assert!(error.contains("split.txt") && error.contains("0000000008.png"), "{error}");
+    // What a list should not have named is an error all the same.
+    assert!(
+        message(open(root.path(), Some("day/drive 9 l"), skipping)).contains("0000000009.png: the frame is missing")
+    );
+}
+
+#[test]
 fn a_picture_that_is_cut_is_an_error_with_its_path() {
     let root = made_up(3..7);
     let path = root.path().join("day/drive/image_02/data/0000000005.png");
@@ -151,6 +173,70 @@ fn a_picture_that_is_cut_is_an_error_with_its_path() {
     let kitti = open(root.path(), Some("day/drive 5 l"), TARGET_ONLY).unwrap();
     let error = kitti.image(0, 0).unwrap_err().to_string();
     assert!(error.contains("0000000005.png") && error.contains("cut short"), "{error}");
+}
+
+#[test]
+fn frames_without_the_depth_that_was_asked_for_are_counted_and_say_where_it_was_looked_for() {
+    let root = made_up(3..7);
+    let with = |ground_truth| Options { ground_truth, ..TARGET_ONLY };
+    for (ground_truth, what, place) in [
+        (GroundTruth::Improved, "the improved ground truth", "proj_depth/groundtruth/image_02/0000000003.png"),
+        (GroundTruth::Lidar(DepthAxis::CameraZ), "the LiDAR scan", "velodyne_points/data/0000000003.bin"),
+    ] {
+        if ground_truth != GroundTruth::Improved {
+            fs::write(root.path().join("day/calib_velo_to_cam.txt"), "R: 1 0 0 0 1 0 0 0 1\nT: 0 0 0\n").unwrap();
+            let lines = "S_rect_02: 24 16\nS_rect_03: 24 16\nR_rect_00: 1 0 0 0 1 0 0 0 1\n\
+                         P_rect_02: 12 0 11 0 0 12 7 0 0 0 1 0\nP_rect_03: 12 0 13 0 0 12 7 0 0 0 1 0\n";
+            fs::write(root.path().join("day/calib_cam_to_cam.txt"), lines).unwrap();
+        }
+        let error = message(open(root.path(), None, with(ground_truth)));
+        for part in ["8 frames lack it;", what, place] {
+            assert!(error.contains(part), "{part}: {error}");
+        }
+        let error = message(open(root.path(), None, Options { neighbours: true, ..with(ground_truth) }));
+        assert!(error.contains("4 frames lack it, and 4 more lack a neighbour"), "{error}");
+    }
+    // With pictures alone missing, depth is not what is missed.
+    let error = message(open(made_up(3..5).path(), None, PUBLISHED));
+    assert!(
+        error.contains("with both neighbours") && error.contains("4 frames") && !error.contains("depth"),
+        "{error}"
+    );
+    // Where some have it, the others are counted.
+    let depth = DepthMap { width: 1, height: 1, metres: vec![2.0] };
+    write_depth_png(root.path().join("day/drive/proj_depth/groundtruth/image_03/0000000005.png"), &depth).unwrap();
+    let kitti = open(root.path(), None, with(GroundTruth::Improved)).unwrap();
+    assert_eq!((kitti.len(), kitti.left_out().without_depth), (1, 7));
+    let list = "day/drive 5 r\nday/drive 5 l\nday/drive 6 l";
+    let error = message(open(root.path(), Some(list), with(GroundTruth::Improved)));
+    assert!(error.contains("line 2") && error.contains("2 of the list's 3 frames lack it"), "{error}");
+}
+
+#[test]
+fn frames_are_found_by_any_ending() {
+    let root = made_up(3..7);
+    let data = root.path().join("day/drive/image_02/data");
+    for (number, ending) in [(3, "JPG"), (4, "jpeg"), (5, "webp"), (6, "PNG")] {
+        let old = data.join(format!("{number:010}.png"));
+        let picture = image::open(&old).unwrap();
+        fs::remove_file(&old).unwrap();
+        picture.save(data.join(format!("{number:010}.{ending}"))).unwrap();
+    }
+    let kitti = open(root.path(), None, TARGET_ONLY).unwrap();
+    assert_eq!(kitti.len(), 8);
+    for sample in 0..4 {
+        let red = kitti.image(sample, 0).unwrap().get_pixel(0, 0)[0];
+        assert!(red.abs_diff(10 * (sample as u8 + 3)) < 4, "{red} of frame {}", kitti.name(sample));
+    }
+    assert!(open(root.path(), Some("day/drive 4 l\n./day/drive 5 l"), PUBLISHED).is_ok());
+}
+
+#[test]
+fn spellings_of_a_drive_are_one_drive() {
+    let root = made_up(3..7);
+    let kitti = open(root.path(), Some("day/drive 4 l\n./day//drive/ 4 l"), PUBLISHED).unwrap();
+    assert_eq!(names(&kitti), ["day/drive 4 l", "day/drive 4 l"]);
+    assert_eq!(kitti.drives.len(), 1);
 }
 
 #[test]
@@ -241,6 +327,19 @@ fn without_a_list_the_real_piece_gives_its_triplets() {
     // By itself the depth is the scan's where there is one: frames 8, 16, 24, 32 and 40 of the long drive.
     let with_depth = (0..kitti.len()).filter(|&i| kitti.depth(i).unwrap().is_some()).count();
     assert_eq!(with_depth, 5);
+}
+
+#[test]
+fn a_mirrored_picture_has_a_mirrored_camera_but_for_the_published_constants() {
+    let root = made_up(3..7);
+    let pixels = Camera::Pixels { fx: 12.0, fy: 12.0, cx: 6.0, cy: 7.0 };
+    for (camera, cx) in [(pixels, 1.0 - 1.0 / 12.0 - 0.25), (Camera::KittiPublished, 0.5)] {
+        let kitti = open(root.path(), Some("day/drive 5 r"), Options { camera, ..PUBLISHED }).unwrap();
+        let whole = crate::data::Subset::new(Arc::new(kitti), vec![0]);
+        let mirrored = whole.mirrored_intrinsics(0, 12);
+        assert!((mirrored.cx - cx).abs() < 1e-12, "{mirrored:?}");
+        assert_eq!(Intrinsics { cx: whole.intrinsics(0).cx, ..mirrored }, whole.intrinsics(0));
+    }
 }
 
 #[test]

@@ -212,3 +212,13 @@ fn the_mean_map_averages_inverse_depth() {
     let image = evaluate_image(&mean.inverse_depth, mean.size, &truth, Protocol::Dense, Scale::Median).unwrap();
     assert!(image.metrics.unwrap().abs_rel < 1e-6);
 }
+
+#[test]
+fn protocols_and_scales_are_called_what_they_are_chosen_by() {
+    for name in ["dense", "eigen", "eigen-camera-z", "improved"] {
+        assert_eq!(name.parse::<Protocol>().unwrap().to_string(), name);
+    }
+    for name in ["median", "stereo", "5.4"] {
+        assert_eq!(name.parse::<Scale>().unwrap().to_string(), name);
+    }
+}

@@ -1,0 +1,159 @@
+//! `parallax eval` from the outside: what was measured is said with the numbers.
+#![cfg(feature = "cli")]
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::OnceLock;
+
+use parallax::data::Dataset;
+use parallax::data::kitti::{Kitti, Options};
+use parallax::formats::npy::write_npy_shaped;
+use parallax::monovit::{MonoVit, Preset};
+use parallax::train::RunConfig;
+use parallax::train::run::write_weights;
+
+/// A street of 64x96 with six frames, as files; weights for that size as they are drawn.
+fn made() -> &'static (PathBuf, PathBuf) {
+    static MADE: OnceLock<(PathBuf, PathBuf)> = OnceLock::new();
+    MADE.get_or_init(|| {
+        let place = Path::new(env!("CARGO_TARGET_TMPDIR")).join("eval");
+        // What an earlier run left.
+        let _ = std::fs::remove_dir_all(&place);
+        let (street, weights) = (place.join("street"), place.join("pico.safetensors"));
+        let size = ["--sequences", "1", "--frames", "6", "--height", "64", "--width", "96"];
+        let output = parallax(&[&["data", "street", "--out", text(&street)][..], &size].concat());
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let config = RunConfig { height: 64, width: 96, ..RunConfig::new(Preset::Pico, 1) };
+        let (_, params) = MonoVit::new::<f32>(config.model(), 11);
+        write_weights(&weights, &params, &config.setup()).expect("weights");
+        (street, weights)
+    })
+}
+
+const DRIVE: &str = "2011_09_26/2011_09_26_drive_0000_sync";
+
+fn parallax(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_parallax")).args(arguments).output().expect("the program runs")
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().expect("a path in UTF-8")
+}
+
+/// Standard output of what must succeed.
+#[track_caller]
+fn said(arguments: &[&str]) -> String {
+    let output = parallax(arguments);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).expect("UTF-8")
+}
+
+/// Fails with `status`, and says all of `words`.
+#[track_caller]
+fn fails(arguments: &[&str], status: i32, words: &[&str]) {
+    let output = parallax(arguments);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(status), "{said}");
+    for word in words {
+        assert!(said.contains(word), "should say {word:?}: {said}");
+    }
+}
+
+/// A street of its own, of which only so many frames have depth; the others are named.
+fn with_depth(place: &Path, frames: usize) -> PathBuf {
+    let street = place.join("street");
+    let size = ["--sequences", "1", "--frames", "6", "--height", "64", "--width", "96"];
+    said(&[&["data", "street", "--out", text(&street)][..], &size].concat());
+    for frame in frames..6 {
+        let depth = format!("{DRIVE}/proj_depth/groundtruth/image_02/{frame:010}.png");
+        std::fs::remove_file(street.join(depth)).expect("removed");
+    }
+    street
+}
+
+#[test]
+fn what_was_measured_is_said_in_the_table_and_in_json() {
+    let (_, weights) = made();
+    let place = tempfile::tempdir().expect("a folder");
+    let street = with_depth(place.path(), 4);
+    let flags = ["eval", "--weights", text(weights), "--data", text(&street), "--scale", "2.5", "--flip"];
+    let table = said(&flags);
+    let missing = "proj_depth/groundtruth/image_02/0000000004.png";
+    for line in [
+        &format!("weights   {}, maps of 96x64, joined with the mirrored picture's", weights.display())[..],
+        &format!("data      {}", street.display()),
+        "protocol  dense: 0.001 to 80 m, the whole picture",
+        "scaling   times 2.5",
+        "images    4 of 6 frames",
+        "skipped   2: no ground-truth depth (the first: ",
+        missing,
+        "Abs Rel",
+    ] {
+        assert!(table.contains(line), "{line}: {table}");
+    }
+    let json: serde_json::Value = serde_json::from_str(&said(&[&flags[..], &["--json"]].concat())).expect("JSON");
+    assert_eq!((&json["weights"], &json["data"]), (&text(weights).into(), &text(&street).into()));
+    assert_eq!((&json["protocol"], &json["scale"], &json["flip"]), (&"dense".into(), &"2.5".into(), &true.into()));
+    assert_eq!((&json["frames"], &json["images"]), (&6.into(), &4.into()));
+    assert_eq!((&json["height"], &json["width"]), (&64.into(), &96.into()));
+    let [skipped] = &json["skipped"].as_array().expect("a list")[..] else { panic!("{json}") };
+    assert_eq!((&skipped["why"], &skipped["frames"]), (&"no ground-truth depth".into(), &2.into()));
+    assert!(skipped["first"].as_str().expect("a path").ends_with(missing));
+    assert!(
+        json["abs_rel"].as_f64().expect("a number") > 0.0 && json["per_image"].as_array().expect("a list").len() == 4
+    );
+}
+
+#[test]
+fn missing_depth_is_not_missing_frames() {
+    let (_, weights) = made();
+    let place = tempfile::tempdir().expect("a folder");
+    let street = with_depth(place.path(), 0);
+    let flags = ["eval", "--weights", text(weights), "--data", text(&street)];
+    let path = "proj_depth/groundtruth/image_02/0000000000.png";
+    fails(&flags, 1, &["no ground-truth depth: 6 frames lack it", path]);
+    let split = place.path().join("list.txt");
+    std::fs::write(&split, format!("{DRIVE} 2 l\n{DRIVE} 3 l\n")).expect("written");
+    let words = ["list.txt", "line 1", "image_02/0000000002.png", "2 of the list's 2 frames lack it"];
+    fails(&[&flags[..], &["--split", text(&split)]].concat(), 1, &words);
+    let empty = place.path().join("empty");
+    std::fs::create_dir(&empty).expect("made");
+    fails(&["eval", "--weights", text(weights), "--data", text(&empty)], 1, &["no frames found", "image_02/data"]);
+}
+
+#[test]
+fn the_truth_as_another_programs_disparities_is_perfect() {
+    let (street, _) = made();
+    let place = tempfile::tempdir().expect("a folder");
+    let split = place.path().join("list.txt");
+    std::fs::write(&split, format!("{DRIVE} 3 l\n{DRIVE} 1 l\n{DRIVE} 4 l\n")).expect("written");
+    let data = Kitti::open(street, Some(&split), 64, 96, Options { neighbours: false, ..Options::default() });
+    let data = data.expect("opened");
+    let mut values = Vec::new();
+    for sample in 0..3 {
+        let depth = data.depth(sample).expect("read").expect("depth");
+        // In a unit of its own.
+        values.extend(depth.metres.iter().map(|&m| if m > 0.0 { 7.0 / m } else { 0.01 }));
+    }
+    let file = place.path().join("disps.npy");
+    write_npy_shaped(&file, &values, &[3, 64, 96]).expect("written");
+    let flags = ["eval", "--disparities", text(&file), "--data", text(street), "--split", text(&split)];
+    let json: serde_json::Value = serde_json::from_str(&said(&[&flags[..], &["--json"]].concat())).expect("JSON");
+    assert!(json["abs_rel"].as_f64().expect("a number") < 1e-5 && json["a1"] == 1.0, "{json}");
+    assert!((json["ratio_median"].as_f64().expect("a number") - 7.0).abs() < 1e-3, "{json}");
+    assert_eq!((&json["weights"], &json["disparities"]), (&serde_json::Value::Null, &text(&file).into()));
+    assert!(said(&flags).contains("disps.npy, maps of 96x64"));
+    // The order counts.
+    std::fs::write(&split, format!("{DRIVE} 1 l\n{DRIVE} 3 l\n{DRIVE} 4 l\n")).expect("written");
+    let json: serde_json::Value = serde_json::from_str(&said(&[&flags[..], &["--json"]].concat())).expect("JSON");
+    assert!(json["abs_rel"].as_f64().expect("a number") > 1e-3, "{json}");
+
+    std::fs::write(&split, format!("{DRIVE} 1 l\n")).expect("written");
+    fails(&flags, 1, &["disps.npy", "has 3 maps", "[3, 64, 96]", "1 frames"]);
+    write_npy_shaped(&file, &values, &[3 * 64, 96]).expect("written");
+    fails(&flags, 1, &["disps.npy", "[frames, height, width]", "[192, 96]"]);
+    write_npy_shaped(&file, &vec![-1.0; 64 * 96], &[1, 64, 96]).expect("written");
+    fails(&flags, 1, &[&format!("{DRIVE} 1 l"), "row 0, column 0 is -1"]);
+    fails(&["eval", "--data", text(street)], 2, &["--weights"]);
+    fails(&[&flags[..], &["--flip"]].concat(), 2, &["--flip"]);
+}
