@@ -8,16 +8,16 @@ use parallax::monovit::{Ablation, Config, Preset};
 #[derive(clap::Args, Clone)]
 #[command(next_help_heading = "Ablations of the networks")]
 pub struct Networks {
-    /// At most so many transformer paths a stage: 2, 1 or 0.
+    /// Largest number of transformer paths in a stage: 2, 1 or 0 [default: the preset's].
     #[arg(long, value_name = "N")]
     transformer_paths: Option<usize>,
-    /// Without the CNN path beside the transformer paths.
+    /// Leave out the CNN path beside the transformer paths.
     #[arg(long)]
     no_cnn_path: bool,
-    /// Without the decoder's channel attention.
+    /// Leave out the decoder's channel attention.
     #[arg(long)]
     no_decoder_attention: bool,
-    /// The largest DropPath probability, instead of the size's own.
+    /// Largest DropPath probability [default: the preset's].
     #[arg(long, value_name = "PROBABILITY")]
     drop_path: Option<f64>,
 }
@@ -50,16 +50,16 @@ impl Networks {
 #[derive(clap::Args, Clone)]
 #[command(next_help_heading = "Ablations of the loss")]
 pub struct Loss {
-    /// Keep the pixels that an unwarped neighbour explains better.
+    /// Switch auto-masking off: keep the pixels that an unwarped neighbour explains better.
     #[arg(long)]
     no_auto_mask: bool,
-    /// What is made of the errors of a pixel's sources.
+    /// How a pixel's errors over its source frames are combined [default: minimum].
     #[arg(long)]
     reprojection: Option<Reprojection>,
-    /// The size at which smaller disparities are compared.
+    /// Resolution at which the loss of the smaller disparities is computed [default: full].
     #[arg(long)]
     scales: Option<Scales>,
-    /// The share of SSIM in the photometric error; 0 for none.
+    /// Share of SSIM in the photometric error, 0 to 1 [default: 0.85].
     #[arg(long, value_name = "SHARE")]
     ssim: Option<f64>,
 }

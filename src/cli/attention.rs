@@ -26,18 +26,18 @@ pub struct Args {
     /// A picture (PNG, JPEG).
     #[arg(value_name = "IMAGE")]
     image: PathBuf,
-    /// The pixel that looks: column and row in the picture, from 0 at the upper left.
+    /// Query pixel: column and row in the picture, from 0 at the upper left.
     #[arg(long, value_name = "X,Y")]
     at: Point,
-    /// Where the pictures go: NAME_attention.png (the sheet), NAME_saliency.png, and NAME_stageS_pathP_layerL.png, each
+    /// Folder for the pictures: NAME_attention.png (the sheet), NAME_saliency.png, and NAME_stageS_pathP_layerL.png, each
     /// the mean over the heads.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Also every head: NAME_stageS_pathP_layerL_headH.png.
+    /// Also write every head: NAME_stageS_pathP_layerL_headH.png.
     #[arg(long)]
     heads: bool,
-    /// The saliency is that of the mean disparity over a square around the pixel: so many pixels to each side, as the
-    /// networks see the picture.
+    /// Saliency is computed for the mean disparity over a square around the pixel: its half width, in pixels of the
+    /// picture as the networks see it.
     #[arg(long, value_name = "PIXELS", default_value_t = 1, value_parser = clap::value_parser!(u16).range(0..=1024))]
     radius: u16,
     /// Print one JSON object: what was written.

@@ -16,13 +16,13 @@ pub struct Args {
     /// encoder.pth, depth.pth, pose_encoder.pth, pose.pth.
     #[arg(value_name = "OUT")]
     out: PathBuf,
-    /// Take what fits and leave out the rest, which is listed.
+    /// Load the parameters that fit, and list the others.
     #[arg(long)]
     allow_partial: bool,
-    /// Height of the pictures that the network saw, instead of what the weights say.
+    /// Height of the pictures that the network saw [default: that of the weights].
     #[arg(long, value_name = "PIXELS")]
     height: Option<usize>,
-    /// Width of the pictures that the network saw, instead of what the weights say.
+    /// Width of the pictures that the network saw [default: that of the weights].
     #[arg(long, value_name = "PIXELS")]
     width: Option<usize>,
     /// Replace what stands at OUT.

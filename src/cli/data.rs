@@ -21,13 +21,13 @@ enum What {
 
 #[derive(clap::Args)]
 struct StreetArgs {
-    /// A new or empty folder.
+    /// Folder to write to, new or empty.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// How many sequences.
+    /// Number of sequences.
     #[arg(long, default_value_t = 4)]
     sequences: usize,
-    /// Frames of each.
+    /// Frames in each sequence.
     #[arg(long, default_value_t = 24)]
     frames: usize,
     /// Height of the pictures.
@@ -36,10 +36,10 @@ struct StreetArgs {
     /// Width of the pictures.
     #[arg(long, default_value_t = 320)]
     width: usize,
-    /// Everything random follows from this number.
+    /// Seed of everything random.
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Let other cars drive too.
+    /// Add moving cars.
     #[arg(long)]
     moving_cars: bool,
 }

@@ -23,10 +23,10 @@ pub struct Args {
     /// the sigmoid), one map for each frame in the order of the split.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["weights", "allow_partial", "height", "width", "flip"])]
     disparities: Option<PathBuf>,
-    /// What to measure on: `street` (of a seed that no run trains on) or a folder in the layout of KITTI raw.
+    /// Frames to measure on: `street` (with a seed that no run trains on) or a folder in the layout of KITTI raw.
     #[arg(long, value_name = "street|DIR", default_value = "street")]
     data: String,
-    /// The frames of a folder: lines `FOLDER FRAME SIDE`. All of them, without.
+    /// List of a folder's frames, lines `FOLDER FRAME SIDE` [default: all].
     #[arg(long, value_name = "FILE")]
     split: Option<PathBuf>,
     /// Which pixels count: dense, eigen, eigen-camera-z, improved.
@@ -35,7 +35,7 @@ pub struct Args {
     /// How predictions get their scale: median, stereo, or a factor.
     #[arg(long, default_value = "median", value_parser = |s: &str| s.parse::<Scale>().map_err(|e| e.to_string()))]
     scale: Scale,
-    /// Predict on the mirrored picture too, and join both.
+    /// Flip post-processing: predict on the mirrored picture too, and join both.
     #[arg(long)]
     flip: bool,
     /// Seed of the street.

@@ -10,10 +10,10 @@ use serde::Serialize;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Only this op.
+    /// Check only this op [default: all].
     #[arg(long, value_name = "NAME")]
     op: Option<String>,
-    /// The seed of inputs and cotangents.
+    /// Seed of inputs and cotangents.
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
     /// Print one JSON object.

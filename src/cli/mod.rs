@@ -34,7 +34,7 @@ use parallax::{Error, Result, printable};
 #[derive(Parser)]
 #[command(name = "parallax", version, about, max_term_width = 100)]
 struct Cli {
-    /// Threads to compute on; all processors unless given.
+    /// Number of threads [default: one for each processor].
     #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
     #[command(subcommand)]
@@ -45,21 +45,21 @@ struct Cli {
 enum Command {
     /// Train; with no flags: the reduced network on the embedded street.
     Train(Box<train::Args>),
-    /// Measure weights against ground-truth depth: the seven metrics.
+    /// Evaluate weights against ground-truth depth: the seven standard metrics.
     Eval(eval::Args),
-    /// Turn pictures into depth maps.
+    /// Predict depth maps of pictures.
     Predict(predict::Args),
-    /// Turn weights into another kind of file: PyTorch's .pth, safetensors, NumPy's .npz.
+    /// Convert weights between file formats: PyTorch's .pth, safetensors, NumPy's .npz.
     Convert(convert::Args),
-    /// Show what a pixel looks at: attention by path and head, and what its disparity depends on.
+    /// Draw attention maps of a pixel, by path and head, and the saliency of its disparity.
     Attention(attention::Args),
-    /// Check every op's gradient against finite differences, now, on this machine.
+    /// Check the gradient of every op against finite differences on this machine.
     Gradcheck(gradcheck::Args),
-    /// Time a training step or an inference, op by op, and against what this machine could do.
+    /// Time a training step or an inference, op by op, and against the machine's limits.
     Bench(bench::Args),
-    /// Count parameters, arithmetic and memory before you start.
+    /// Count parameters, arithmetic and memory of a network.
     Info(info::Args),
-    /// Write the embedded street as files.
+    /// Write the embedded street as a data set of files.
     Data(data::Args),
 }
 
@@ -100,6 +100,14 @@ fn flag_of(subcommand: &str, field: &str) -> String {
     let found =
         command.find_subcommand(subcommand).is_some_and(|c| c.get_arguments().any(|a| a.get_long() == Some(&long)));
     if found { format!("--{long}") } else { field.to_owned() }
+}
+
+/// Focal lengths and principal point, as `--intrinsics` takes them.
+fn pinhole(text: &str) -> std::result::Result<[f64; 4], String> {
+    let numbers: Option<Vec<f64>> =
+        text.split(',').map(|n| n.trim().parse().ok().filter(|x: &f64| x.is_finite())).collect();
+    let camera = numbers.and_then(|n| <[f64; 4]>::try_from(n).ok()).filter(|[fx, fy, ..]| *fx > 0.0 && *fy > 0.0);
+    camera.ok_or_else(|| "expected four numbers with commas between them, fx and fy above 0".to_owned())
 }
 
 /// The pool that kernels run in, with this thread as one of its workers: handing work over from outside a pool costs a

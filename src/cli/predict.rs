@@ -40,7 +40,7 @@ pub struct Args {
     /// alpha is ignored.
     #[arg(required = true, value_name = "INPUT", verbatim_doc_comment)]
     inputs: Vec<PathBuf>,
-    /// Where the results go; made if it is missing.
+    /// Folder for the results; created if it is missing.
     ///
     /// A picture's results bear its name; those of a folder lie as its pictures do. With several inputs
     /// each folder's results go into a folder of its own name. Two pictures whose results would be the
@@ -68,10 +68,10 @@ pub struct Args {
     /// Leave pictures alone whose results are all there.
     #[arg(long)]
     skip_existing: bool,
-    /// Predict on the mirrored picture too, and join both: twice the time, better borders.
+    /// Flip post-processing: predict on the mirrored picture too, and join both. Twice the time, better borders.
     #[arg(long, help_heading = "Network")]
     flip: bool,
-    /// Depths are multiplied by this; 1 unless given.
+    /// Factor that depths are multiplied by [default: 1].
     #[arg(long, value_name = "FACTOR", group = "unit", help_heading = "Scale (one of)", value_parser = above_zero)]
     scale: Option<f64>,
     /// Metres for weights from stereo pairs whose baseline of 0.54 m was called 0.1: --scale 5.4.
@@ -80,11 +80,11 @@ pub struct Args {
     /// Metres by the camera's known height over the road (KITTI: 1.65), for every picture on its own.
     #[arg(long, value_name = "METRES", group = "unit", help_heading = "Scale (one of)", value_parser = above_zero)]
     camera_height: Option<f64>,
-    /// Focal lengths and principal point in pixels of the pictures.
+    /// Focal lengths and principal point, in pixels of the pictures [default: from --fov].
     #[arg(long, value_name = "FX,FY,CX,CY", group = "camera", help_heading = "Camera (for --ply, --camera-height)")]
-    #[arg(value_parser = pinhole)]
+    #[arg(value_parser = super::pinhole)]
     intrinsics: Option<[f64; 4]>,
-    /// Horizontal field of view, for square pixels around the middle; KITTI's 81.5 unless given.
+    /// Horizontal field of view in degrees, for square pixels around the middle [default: 81.5, KITTI's].
     #[arg(long, value_name = "DEGREES", group = "camera", help_heading = "Camera (for --ply, --camera-height)")]
     #[arg(value_parser = field_of_view)]
     fov: Option<f64>,
@@ -124,13 +124,6 @@ fn above_zero(text: &str) -> Result<f64, String> {
 fn field_of_view(text: &str) -> Result<f64, String> {
     let number = text.parse::<f64>().ok().filter(|x| (1.0..=175.0).contains(x));
     number.ok_or_else(|| "expected degrees from 1 to 175".to_owned())
-}
-
-fn pinhole(text: &str) -> Result<[f64; 4], String> {
-    let numbers: Option<Vec<f64>> =
-        text.split(',').map(|n| n.trim().parse().ok().filter(|x: &f64| x.is_finite())).collect();
-    let camera = numbers.and_then(|n| <[f64; 4]>::try_from(n).ok()).filter(|[fx, fy, ..]| *fx > 0.0 && *fy > 0.0);
-    camera.ok_or_else(|| "expected four numbers with commas between them, fx and fy above 0".to_owned())
 }
 
 /// What was done, as JSON.
@@ -299,9 +292,9 @@ mod tests {
 
     #[test]
     fn numbers_from_the_command_line_are_checked() {
-        assert_eq!(pinhole("721.5, 722,609,172.8"), Ok([721.5, 722.0, 609.0, 172.8]));
+        assert_eq!(super::super::pinhole("721.5, 722,609,172.8"), Ok([721.5, 722.0, 609.0, 172.8]));
         for wrong in ["", "1,2,3", "1,2,3,4,5", "0,1,2,3", "1,-1,2,3", "1,2,nan,3", "a,b,c,d"] {
-            assert!(pinhole(wrong).is_err(), "{wrong}");
+            assert!(super::super::pinhole(wrong).is_err(), "{wrong}");
         }
         assert_eq!(above_zero("1.65"), Ok(1.65));
         for wrong in ["0", "-1", "nan", "inf", "x"] {

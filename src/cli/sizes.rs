@@ -6,7 +6,7 @@ use parallax::monovit::setup::check_size;
 
 #[derive(clap::Args, Clone)]
 pub struct Sizes {
-    /// The size of the networks.
+    /// Size of the networks.
     #[arg(long, default_value = "nano")]
     pub preset: Preset,
     /// Height of the pictures, a multiple of 32.
@@ -15,7 +15,7 @@ pub struct Sizes {
     /// Width of the pictures, a multiple of 32.
     #[arg(long, value_name = "PIXELS", default_value_t = 320)]
     pub width: usize,
-    /// Pictures (or triplets) at a time.
+    /// Batch size, in pictures or triplets.
     #[arg(long, value_name = "N", default_value_t = 4)]
     pub batch: usize,
     /// Print one JSON object.

@@ -19,82 +19,83 @@ use super::progress::Progress;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Where frames come from: `street` (made by the program, the default) or a folder in the layout of KITTI raw.
+    /// Training frames: `street` (rendered by the program) or a folder in the layout of KITTI raw [default: street].
     #[arg(long, value_name = "street|DIR")]
     data: Option<String>,
-    /// The frames of a folder to train on: lines `FOLDER FRAME SIDE`. All that have neighbours, without.
+    /// List of a folder's frames to train on, lines `FOLDER FRAME SIDE` [default: all that have both neighbours].
     #[arg(long, value_name = "FILE")]
     split: Option<PathBuf>,
-    /// The frames of a folder to validate on. Every tenth training frame is set aside, without.
+    /// List of a folder's frames to validate on [default: every tenth training frame is set aside].
     #[arg(long, value_name = "FILE")]
     val_split: Option<PathBuf>,
-    /// The camera that took a folder's pictures: its field of view in degrees across. Without, camera.toml among the data
-    /// says it (width, height, fx, fy, cx, cy in pixels, or fov), or the calibration.
+    /// Horizontal field of view, in degrees, of the camera that took a folder's pictures [default: from camera.toml among
+    /// the data (width, height, fx, fy, cx, cy in pixels, or fov), or else from the calibration].
     #[arg(long, value_name = "DEGREES", conflicts_with_all = ["intrinsics", "camera"])]
     fov: Option<f64>,
-    /// Its focal lengths and principal point, in pixels of the pictures as they are stored.
-    #[arg(long, value_name = "FX,FY,CX,CY", value_delimiter = ',', num_args = 4, conflicts_with = "camera")]
-    intrinsics: Option<Vec<f64>>,
-    /// KITTI's published constants (fx 0.58, fy 1.92 of the size) whatever the data say, or its calibration and nothing
-    /// else.
+    /// Focal lengths and principal point of that camera, in pixels of the pictures as they are stored [default: as for
+    /// --fov].
+    #[arg(long, value_name = "FX,FY,CX,CY", value_parser = super::pinhole, conflicts_with = "camera")]
+    intrinsics: Option<[f64; 4]>,
+    /// A camera by name: KITTI's published constants (fx 0.58, fy 1.92 of the size) whatever the data say, or the
+    /// calibration and nothing else [default: as for --fov].
     #[arg(long, value_name = "kitti-published|calibrated")]
     camera: Option<NamedCamera>,
-    /// The size of the networks; that of the weights to start from, or nano, unless given.
+    /// Size of the networks [default: nano, or that of the weights to start from].
     #[arg(long)]
     preset: Option<Preset>,
-    /// Height of the pictures that the networks see, a multiple of 32; that of the weights to start from, or 96.
+    /// Height of the pictures that the networks see, a multiple of 32 [default: 96, or that of the weights to start from].
     #[arg(long, value_name = "PIXELS")]
     height: Option<usize>,
-    /// Width of the pictures that the networks see, a multiple of 32; that of the weights to start from, or 320.
+    /// Width of the pictures that the networks see, a multiple of 32 [default: 320, or that of the weights to start from].
     #[arg(long, value_name = "PIXELS")]
     width: Option<usize>,
-    /// Batch size: how many samples a step sees; 4 unless given.
+    /// Batch size [default: 4].
     #[arg(long, value_name = "N")]
     batch: Option<usize>,
-    /// Number of training steps; 3800 unless given. With --resume, the number to go on to.
+    /// Number of training steps; with --resume, the number to go on to [default: 3800].
     #[arg(long, value_name = "N", conflicts_with = "epochs")]
     steps: Option<u64>,
-    /// A line in the log every so many steps; 10 unless given.
+    /// Steps between two lines of the log [default: 10].
     #[arg(long, value_name = "N")]
     log_every: Option<u64>,
-    /// The state is written and the weights are validated every so many steps; 200 unless given.
+    /// Steps between two checkpoints, at which the state is saved and the weights are validated [default: 200].
     #[arg(long, value_name = "N")]
     checkpoint_every: Option<u64>,
-    /// How many times through the data, instead of steps.
+    /// Number of passes over the data, instead of --steps.
     #[arg(long, value_name = "N")]
     epochs: Option<u64>,
-    /// The learning rate of the depth decoder, 0.001 (0.0001 where training starts from weights) unless given; those of
-    /// the encoder and of the pose networks keep their ratio to it.
+    /// Learning rate of the depth decoder; those of the encoder and of the pose networks keep their ratio to it [default:
+    /// 0.001, or 0.0001 where training starts from weights].
     #[arg(long, value_name = "RATE")]
     learning_rate: Option<f64>,
-    /// The seed that everything random follows from; 0 unless given.
+    /// Seed of everything random [default: 0].
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
-    /// A configuration such as a run's config.toml, whole or in part; flags win over it. It decides the recipe for weights
-    /// to start from, too.
+    /// Configuration, such as a run's config.toml, whole or in part. Flags win over it; it wins over the recipe for
+    /// weights to start from.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Weights to start from, all four networks: a run, a file, a folder with encoder.pth, depth.pth, ...; several times
-    /// for several files. The preset is that of the weights.
+    /// Weights of all four networks to start from: a run, a file, or a folder with encoder.pth, depth.pth, ...; several
+    /// times for several files [default: random weights].
     #[arg(long, value_name = "FILE|DIR")]
     init: Vec<PathBuf>,
-    /// Start the depth encoder from an MPViT that was trained on ImageNet.
+    /// Weights of an MPViT that was trained on ImageNet, for the depth encoder to start from.
     #[arg(long, value_name = "FILE")]
     init_encoder: Option<PathBuf>,
-    /// Start the pose encoder from a ResNet-18 that was trained on ImageNet (torchvision's).
+    /// Weights of a ResNet-18 that was trained on ImageNet (torchvision's), for the pose encoder to start from.
     #[arg(long, value_name = "FILE")]
     init_pose: Option<PathBuf>,
-    /// Start from those weights that fit; the others are listed.
+    /// Start from those weights that fit, and list the others.
     #[arg(long)]
     allow_partial: bool,
-    /// Pass over samples with a frame that cannot be read, and say at the end how many they were. Without, the first one
-    /// ends the run.
+    /// Pass over samples with a frame that cannot be read, and say at the end how many they were [default: the first one
+    /// ends the run].
     #[arg(long)]
     skip_bad_frames: bool,
-    /// Go on with an interrupted run.
+    /// Continue this run: an interrupted one, or with --steps a finished one.
     #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "config", "init", "init_encoder", "init_pose", "split", "preset"])]
     resume: Option<PathBuf>,
-    /// The run's folder, new or empty; the first of runs/1, runs/2, ... that is not there, unless given.
+    /// Folder of the run, new or empty [default: the first of runs/1, runs/2, ... that does not exist].
     #[arg(long, value_name = "RUN")]
     out: Option<PathBuf>,
     /// Print `metrics.json` on standard output at the end, and nothing else there.
@@ -375,11 +376,8 @@ fn configuration(args: &Args) -> Result<RunConfig> {
     }
     c.allow_partial |= args.allow_partial;
     c.skip_bad_frames |= args.skip_bad_frames;
-    c.camera = match (&args.intrinsics, args.fov, args.camera) {
-        (Some(numbers), ..) => match numbers[..] {
-            [fx, fy, cx, cy] => Camera::Pixels { fx, fy, cx, cy },
-            _ => return Err(Error::setting("--intrinsics", "expected four numbers: fx,fy,cx,cy")),
-        },
+    c.camera = match (args.intrinsics, args.fov, args.camera) {
+        (Some([fx, fy, cx, cy]), ..) => Camera::Pixels { fx, fy, cx, cy },
         (None, Some(degrees), _) => Camera::Fov { degrees },
         (None, None, Some(NamedCamera::KittiPublished)) => Camera::KittiPublished,
         (None, None, Some(NamedCamera::Calibrated)) => Camera::Calibrated,
@@ -429,4 +427,40 @@ fn open(config: &RunConfig) -> Result<RunData> {
             }
         }
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+    use parallax::train::recipe::RunConfig;
+
+    #[derive(clap::Parser)]
+    struct Command {
+        #[command(flatten)]
+        args: super::Args,
+    }
+
+    /// Flags that may stay unsaid are options without a value of their own: the defaults are the configuration's.
+    #[test]
+    fn help_states_the_defaults_that_hold() {
+        let c = RunConfig::usual();
+        let command = Command::command();
+        let expected = [
+            ("data", c.data),
+            ("height", c.height.to_string()),
+            ("width", c.width.to_string()),
+            ("batch", c.batch.to_string()),
+            ("steps", c.steps.to_string()),
+            ("log_every", c.log_every.to_string()),
+            ("checkpoint_every", c.checkpoint_every.to_string()),
+            ("learning_rate", c.optim.rate.to_string()),
+            ("seed", c.seed.to_string()),
+            ("ssim", c.loss.ssim.to_string()),
+        ];
+        for (flag, value) in expected {
+            let argument = command.get_arguments().find(|a| a.get_id() == flag).unwrap_or_else(|| panic!("--{flag}"));
+            let help = argument.get_help().map(ToString::to_string).unwrap_or_default().replace('\n', " ");
+            assert!(help.contains(&format!("[default: {value}")), "--{flag}: {help:?} does not say {value}");
+        }
+    }
 }

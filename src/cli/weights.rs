@@ -13,13 +13,13 @@ pub struct WeightsArgs {
     /// depth.pth, ...; several times for several files.
     #[arg(long, value_name = "FILE|DIR", required = true)]
     weights: Vec<PathBuf>,
-    /// Take what fits and leave out the rest, which is listed.
+    /// Load the parameters that fit, and list the others.
     #[arg(long)]
     allow_partial: bool,
-    /// Height of the pictures that the network sees, instead of what the weights say.
+    /// Height of the pictures that the network sees, a multiple of 32 [default: that of the weights].
     #[arg(long, value_name = "PIXELS")]
     height: Option<usize>,
-    /// Width of the pictures that the network sees, instead of what the weights say.
+    /// Width of the pictures that the network sees, a multiple of 32 [default: that of the weights].
     #[arg(long, value_name = "PIXELS")]
     width: Option<usize>,
 }

@@ -22,17 +22,17 @@ pub struct Args {
 
 #[derive(clap::Subcommand)]
 enum What {
-    /// A whole training step: four networks, four scales, the loss, backward, AdamW.
+    /// Time a whole training step: four networks, four scales, the loss, backward, AdamW.
     Step(Timed),
-    /// Disparities of pictures, nothing recorded.
+    /// Time the prediction of disparities.
     Infer(Timed),
-    /// What each op of a training step reaches of what this machine could do.
+    /// Compare each op of a training step with the machine's limits of arithmetic and memory.
     #[command(alias = "ops")]
     Roofline(Counted),
     /// One convolution, forward: 3x3, batch 2, 3 channels of 320x320 to 16.
     #[command(hide = true)]
     Conv {
-        /// How often it is timed.
+        /// Number of timed iterations.
         #[arg(long, value_name = "N", default_value_t = 100)]
         iterations: usize,
         /// Print one JSON object.
@@ -51,7 +51,7 @@ enum What {
 struct Counted {
     #[command(flatten)]
     sizes: Sizes,
-    /// How often it is timed, after three times that are not counted.
+    /// Number of timed iterations, after three that are not counted.
     #[arg(long, value_name = "N", default_value_t = 10)]
     iterations: usize,
 }
