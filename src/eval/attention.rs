@@ -55,7 +55,7 @@ fn layer_name(stage: usize, path: usize, layer: usize) -> String {
     format!("encoder.mhca_stages.{stage}.mhca_blks.{path}.MHCA_layers.{layer}")
 }
 
-/// A network looking at an image.
+/// Attention of a pixel, and the disparities, of one prediction.
 #[derive(Clone, Debug)]
 pub struct Attention<T: Float> {
     /// The disparities at 1, 1/2, 1/4, 1/8 of the image, `[1, h, w, 1]`.

@@ -24,7 +24,7 @@ const LEVEL: f64 = 0.996_194_698;
 /// There is a road if so many of the pixels are level.
 const LEAST_SHARE: f64 = 0.01;
 
-/// The ground, as a map of inverse depth shows it.
+/// Ground plane found in a map of inverse depth.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ground {
     /// The camera's height over it, in the unit of the map's depth.

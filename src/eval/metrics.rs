@@ -13,14 +13,14 @@ use crate::data::Dataset;
 use crate::depth::{DepthMap, resize_bilinear};
 use crate::{Error, Result};
 
-/// Depth is compared from here on, in metres; predictions are cut to the same range.
+/// Least depth that is evaluated, in metres; predictions are clamped to the same range.
 pub const MIN_DEPTH: f64 = 1e-3;
-/// Up to here.
+/// Greatest depth that is evaluated, in metres.
 pub const MAX_DEPTH: f64 = 80.0;
 /// The scale of a network trained on stereo pairs whose baseline was called 0.1: KITTI's is 0.54 m.
 pub const STEREO_SCALE: f64 = 5.4;
 
-/// Which pixels count, and which ground truth belongs to it.
+/// Evaluation protocol: which pixels are evaluated, against which ground truth.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Protocol {
@@ -83,14 +83,14 @@ impl FromStr for Protocol {
     }
 }
 
-/// How a prediction gets its scale.
+/// Scaling of predictions before they are evaluated.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Scale {
     /// Times median(ground truth) / median(prediction), for every image on its own, over the pixels that count.
     Median,
     /// Times [`STEREO_SCALE`].
     Stereo,
-    /// Times this.
+    /// Times this factor.
     Factor(f64),
 }
 
@@ -183,10 +183,10 @@ impl Metrics {
     }
 }
 
-/// What one image gives.
+/// Evaluation of one image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImageMetrics {
-    /// How many pixels counted.
+    /// Number of pixels evaluated.
     pub pixels: usize,
     /// The factor of the median scaling; `None` under another scaling, or without a pixel.
     pub ratio: Option<f64>,
@@ -295,12 +295,12 @@ pub fn mirror(map: &[f32], width: usize) -> Vec<f32> {
     map.chunks_exact(width).flat_map(|row| row.iter().rev().copied()).collect()
 }
 
-/// One image of a [`Report`].
+/// Evaluation of one image of a [`Report`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PerImage {
     /// Drive and frame.
     pub name: String,
-    /// How many pixels counted.
+    /// Number of pixels evaluated.
     pub pixels: usize,
     /// The factor of the median scaling.
     pub ratio: Option<f64>,
@@ -309,10 +309,10 @@ pub struct PerImage {
     pub metrics: Metrics,
 }
 
-/// The metrics of a set of images.
+/// Evaluation of a set of images.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Report {
-    /// How many images the means are over.
+    /// Number of images that the means are over.
     pub images: usize,
     /// The means over images.
     #[serde(flatten)]
@@ -373,8 +373,7 @@ fn standard_deviation(values: impl ExactSizeIterator<Item = f64> + Clone) -> f64
     (values.map(|v| (v - mean).powi(2)).sum::<f64>() / n).sqrt()
 }
 
-/// A predictor that has learned nothing but where near and far usually are: the mean of the inverse depth maps. What a
-/// network has to beat.
+/// Baseline predictor: the mean of the inverse depth maps of the training frames, whatever the picture.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MeanMap {
     /// Rows and columns: the first ground truth's.

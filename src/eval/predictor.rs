@@ -15,18 +15,18 @@ use crate::nn::{Folded, Params};
 use crate::weights::{self, Need, Weights};
 use image::RgbImage;
 
-/// How to predict and to compare.
+/// Settings of an evaluation.
 #[derive(Clone, Copy, Debug)]
 pub struct Evaluation {
-    /// Which pixels, which ground truth.
+    /// Evaluation protocol.
     pub protocol: Protocol,
-    /// How a prediction gets its scale.
+    /// Scaling of predictions.
     pub scale: Scale,
-    /// Whether to predict on the mirrored picture too, and to join both (Monodepth's post-processing).
+    /// Flip post-processing: predict on the mirrored picture too, and join both (Monodepth).
     pub flip: bool,
 }
 
-/// Depth of single pictures: the networks with weights in evaluation mode.
+/// Depth of single pictures, by the networks with weights in evaluation mode.
 ///
 /// ```no_run
 /// use parallax::eval::predictor::Predictor;

@@ -13,15 +13,15 @@ pub struct Input {
     pub name: &'static str,
     /// Its shape.
     pub shape: Shape,
-    /// What it is filled with.
+    /// Distribution of its elements.
     pub fill: Fill,
-    /// Why it is not differentiated, if so.
+    /// Reason why it is not differentiated, for constants.
     pub constant: Option<&'static str>,
     /// Whether its gradient may rightly be zero in this case, though others are not.
     pub ignored: bool,
 }
 
-/// What an input is filled with.
+/// Distribution of an input's elements.
 #[derive(Clone, Debug)]
 pub enum Fill {
     /// Uniform random numbers.
@@ -56,7 +56,7 @@ pub enum Fill {
         /// The greatest.
         high: f64,
     },
-    /// These numbers.
+    /// Given numbers.
     Values(Vec<f64>),
 }
 

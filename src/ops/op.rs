@@ -155,7 +155,7 @@ pub trait Checked: Sized {
     fn cases() -> Vec<Case<Self>>;
 }
 
-/// Which inputs' gradients somebody wants. Reaches the forward pass, so that inference and frozen parts save nothing.
+/// Inputs whose gradients are wanted. Known in the forward pass, so that inference and frozen parts save nothing.
 #[derive(Clone, Debug)]
 pub struct Needs(pub(crate) Vec<bool>);
 
@@ -171,7 +171,7 @@ impl Needs {
     }
 }
 
-/// Why inputs do not fit an op.
+/// Error of a shape rule: why the inputs do not fit an op.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ShapeError(pub String);
 

@@ -135,7 +135,7 @@ registry! {
     "cross_entropy" => cross_entropy::CrossEntropy,
 }
 
-/// One op as the suite sees it.
+/// One registered op: its name and its gradient-check cases.
 pub struct Entry {
     /// The name.
     pub name: &'static str,

@@ -17,7 +17,7 @@ use crate::monovit::setup::check_size;
 use crate::monovit::{Ablation, Config, Preset, Setup};
 use crate::optim::{Decay, Schedule};
 
-/// Steps of the default run.
+/// Number of steps of the default run.
 pub const STEPS: u64 = 3800;
 
 /// The whole number of steps that is nearest to a share of them.
@@ -36,13 +36,13 @@ pub struct OptimConfig {
     /// The learning rate of the pose networks. Their output is scaled by 0.01, so at the depth's rate they follow a
     /// hundred times as slowly.
     pub pose_rate: f64,
-    /// Decoupled weight decay, of every parameter.
+    /// Decoupled weight decay of every parameter.
     pub decay: f64,
     /// The decay rates b1 and b2 of AdamW's moments.
     pub betas: [f64; 2],
-    /// The bound on the norm of all gradients; 0 for none.
+    /// Gradient clipping: bound on the norm of all gradients; 0 for none.
     pub clip: f64,
-    /// The decay of the average of the weights; 0 for none.
+    /// Decay of the exponential moving average of the weights; 0 for none.
     pub average: f64,
     /// The factor on all rates over the run.
     pub schedule: RateSchedule,
@@ -178,29 +178,29 @@ pub struct Plan {
     pub auto_mask_after: u64,
     /// Known rotations for the pose network.
     pub rotations: RotationPlan,
-    /// The seed that everything random follows from.
+    /// Seed of everything random.
     pub seed: u64,
 }
 
-/// Everything that decides a run.
+/// Configuration of a training run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
-    /// The named sizes.
+    /// Named size of the networks.
     pub preset: Preset,
     /// Height of the pictures that the networks see, a multiple of 32.
     pub height: usize,
     /// Width of the pictures that the networks see, a multiple of 32.
     pub width: usize,
-    /// Batch size: how many samples a step sees.
+    /// Batch size.
     pub batch: usize,
     /// Number of training steps.
     pub steps: u64,
-    /// Everything random follows from it.
+    /// Seed of everything random.
     pub seed: u64,
     /// `street`, or a folder in the layout of KITTI raw.
     pub data: String,
-    /// A split list for training; all frames without.
+    /// List of the frames to train on; without it, all frames.
     pub split: Option<PathBuf>,
     /// A split list for a folder: every second frame validates, the others (with ground truth) are reported on. Every
     /// tenth training frame is set aside, without.

@@ -8,7 +8,7 @@ use crate::tensor::gemm::Rows;
 use crate::tensor::pool::Buffer;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
-/// `out = c^(-1/2) q (softmax(k)^T v)` for each head of c channels, the softmax over the tokens (Xu et al. 2021,
+/// Factorised attention: `out = c^(-1/2) q (softmax(k)^T v)` for each head of c channels, the softmax over the tokens (Xu et al. 2021,
 /// 2104.06399, equation 6).
 ///
 /// The input [batch, tokens, 3 C] holds q, k and v beside each other, each head-major; the result is
@@ -16,7 +16,7 @@ use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parall
 /// e^(k - max) v by tiles of tokens with their own maxima, the second multiplies by q.
 #[derive(Clone, Copy, Debug)]
 pub struct FactorisedAttention {
-    /// Heads, which divide C.
+    /// Number of heads; C is a multiple of it.
     pub heads: usize,
     /// Tokens handed to a thread at a time, chosen by the shapes by default.
     pub tile: Tile,

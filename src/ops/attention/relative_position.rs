@@ -8,7 +8,7 @@ use crate::tensor::pool::Buffer;
 use crate::tensor::simd::copy_run;
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
-/// `out = q * (depthwise convolution of v as an image)`, with windows of several sizes, each over its own heads (Xu et
+/// Convolutional relative position encoding: `out = q * (depthwise convolution of v as an image)`, with windows of several sizes, each over its own heads (Xu et
 /// al. 2021, 2104.06399, section 3.3). Zero padding half the window.
 ///
 /// Inputs: qkv [batch, height * width, 3 C], q, k and v side by side; then for every window, over the next heads in
@@ -16,13 +16,13 @@ use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, sim
 /// [batch, height * width, C]. Nothing depends on k.
 #[derive(Clone, Debug)]
 pub struct ConvRelativePosition {
-    /// Rows of the image.
+    /// Height of the image, in tokens.
     pub height: usize,
-    /// Columns of the image.
+    /// Width of the image, in tokens.
     pub width: usize,
-    /// Heads, which divide C.
+    /// Number of heads; C is a multiple of it.
     pub heads: usize,
-    /// For every window: its (odd) extent, and how many heads it serves.
+    /// Windows: the (odd) extent of each, and the number of heads it serves.
     pub windows: Vec<(usize, usize)>,
     /// Image rows a partial sum of the weight gradient covers; 8 by default.
     pub tile: Tile,

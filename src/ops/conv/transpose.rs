@@ -22,15 +22,15 @@ use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 /// transpose goes back. It adds rows and columns at the end, which the window may reach.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ConvTranspose2d {
-    /// Pixels of the output from one pixel of the input to the next, (height, width).
+    /// Stride: pixels of the output from one pixel of the input to the next, (height, width).
     pub stride: [usize; 2],
-    /// Rows and columns that the output lacks on both sides, (height, width).
+    /// Padding: rows and columns taken off the output on both sides, (height, width).
     pub padding: [usize; 2],
-    /// Pixels from one tap of the window to the next, (height, width).
+    /// Dilation: pixels from one tap of the window to the next, (height, width).
     pub dilation: [usize; 2],
-    /// Rows and columns that the output has more, at the end, (height, width): fewer than the stride or the dilation.
+    /// Output padding: rows and columns added at the end of the output, (height, width), fewer than stride or dilation.
     pub output_padding: [usize; 2],
-    /// Channels are cut into so many groups, each convolved for itself.
+    /// Number of groups; each sees in / groups input channels.
     pub groups: usize,
     /// Rows of pixels handed to a thread at a time, chosen by the shapes by default.
     pub tile: Tile,

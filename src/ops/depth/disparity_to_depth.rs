@@ -5,12 +5,12 @@ use crate::ops::elementwise::unary::{Function, Unary};
 use crate::ops::{Case, Input, apply1};
 use crate::tensor::{Float, Var};
 
-/// `1 / (1/max + (1/min - 1/max) d)`: disparity 0 is the greatest depth, 1 the least.
+/// Depth of sigmoid disparity: `1 / (1/max + (1/min - 1/max) d)`. Disparity 0 is the greatest depth, 1 the least.
 #[derive(Clone, Copy, Debug)]
 pub struct DisparityToDepth {
-    /// The depth of disparity 1.
+    /// Depth of disparity 1, the least.
     pub min_depth: f64,
-    /// The depth of disparity 0.
+    /// Depth of disparity 0, the greatest.
     pub max_depth: f64,
 }
 

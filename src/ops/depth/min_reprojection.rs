@@ -6,7 +6,7 @@ use crate::ops::support::sums::pairwise_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
-/// The mean over pixels of the minimum over `candidates`, one or more tensors of one shape; and (auxiliary) the index of
+/// Minimum reprojection: the mean over pixels of the minimum over `candidates`, one or more tensors of one shape; and (auxiliary) the index of
 /// the winner of each pixel, in that shape.
 ///
 /// With the unwarped sources among the candidates this is the auto-mask: a pixel that one of them wins has no gradient

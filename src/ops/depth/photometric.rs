@@ -5,13 +5,13 @@ use crate::ops::Tile;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 
-/// `w mean_c clamp((1 - SSIM) / 2, 0, 1) + (1 - w) mean_c |prediction - target|` for every pixel: from two images
+/// Photometric error `w mean_c clamp((1 - SSIM) / 2, 0, 1) + (1 - w) mean_c |prediction - target|` for every pixel: from two images
 /// `[batch, height, width, channels]` to `[batch, height, width, 1]`. With w = 0 the structural part is not computed.
 ///
 /// The derivative of |0| is 0; for the clamp see [`SsimLoss`](super::ssim::SsimLoss).
 #[derive(Clone, Copy, Debug)]
 pub struct Photometric {
-    /// The weight of the structural part: 0.85 as published.
+    /// Weight of the SSIM term: 0.85 as published.
     pub ssim_weight: f64,
     /// Rows handed to a thread at a time; 16 by default.
     pub tile: Tile,

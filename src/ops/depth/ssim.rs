@@ -13,7 +13,7 @@ use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parall
 const C1: f64 = 0.01 * 0.01;
 const C2: f64 = 0.03 * 0.03;
 
-/// `clamp((1 - SSIM) / 2, 0, 1)` of x and y `[batch, height, width, channels]`, per channel: means over 3x3 windows of the
+/// Structural dissimilarity `clamp((1 - SSIM) / 2, 0, 1)` of x and y `[batch, height, width, channels]`, per channel: means over 3x3 windows of the
 /// images, reflected by one pixel at the edges; `C1 = 0.01^2`, `C2 = 0.03^2`.
 ///
 /// SSIM lies within [-1, 1], so the clamp only catches rounding: its derivative is 1 on the bounds and 0 beyond.
@@ -29,9 +29,9 @@ pub(crate) const TILE: usize = 16;
 /// `ssim * clamp((1 - SSIM) / 2, 0, 1) + l1 * |x - y|` for every element; the kernel of two ops.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Kernel {
-    /// The factor of the structural part; 0 leaves it out.
+    /// Factor of the SSIM term; 0 leaves it out.
     pub ssim: f64,
-    /// The factor of the absolute difference.
+    /// Factor of the absolute difference.
     pub l1: f64,
     /// Rows handed to a thread at a time.
     pub tile: usize,

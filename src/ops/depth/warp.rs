@@ -12,7 +12,7 @@ use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parall
 /// Guards the division by the projected depth, as published.
 const EPSILON: f64 = 1e-7;
 
-/// `source [batch, height, width, channels]` seen from the target camera, given the target's `depth [batch, height,
+/// View synthesis: `source [batch, height, width, channels]` seen from the target camera, given the target's `depth [batch, height,
 /// width, 1]` and the rigid `transform [batch, 3, 4]` from target to source camera.
 ///
 /// Pixel (u, v, 1) -> K^-1 -> times depth -> transform -> K -> divided by (z + 1e-7) -> sampled bilinearly. Outside, the

@@ -4,7 +4,7 @@ use crate::ops::support::put::{begin_sum, put_run};
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
-/// What lies beyond the edge of an image.
+/// Padding mode of sampling: what lies beyond the edge of an image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum GridPadding {
     /// Nothing: 0.
@@ -15,7 +15,7 @@ pub enum GridPadding {
     Reflection,
 }
 
-/// `y [batch, h, w, channels]`: `x [batch, height, width, channels]` at the places `grid [batch, h, w, 2]`, each an
+/// Bilinear sampling at given places. `y [batch, h, w, channels]`: `x [batch, height, width, channels]` at the places `grid [batch, h, w, 2]`, each an
 /// (x, y) with -1 and 1 at the left and right (top and bottom) of the image: at the centres of the outermost pixels if
 /// corners are aligned, else at their outer edges.
 ///
@@ -24,9 +24,9 @@ pub enum GridPadding {
 /// coordinate at or beyond the centre of an outermost pixel, where it is clamped, has gradient 0.
 #[derive(Clone, Copy, Debug)]
 pub struct GridSample {
-    /// What lies beyond the edge.
+    /// Padding mode.
     pub padding: GridPadding,
-    /// Whether -1 and 1 are centres of pixels, not edges.
+    /// Whether -1 and 1 are the centres of the corner pixels, or else the edges of the image.
     pub align_corners: bool,
 }
 

@@ -4,24 +4,24 @@ use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
-/// The largest element of each window of each channel of [batch, height, width, channels]. Padding never wins, a NaN
+/// Max pooling: the largest element of each window of each channel of [batch, height, width, channels]. Padding never wins, a NaN
 /// does. Of several equal ones the first, row by row, gets the gradient.
 #[derive(Clone, Copy, Debug)]
 pub struct MaxPool2d {
     /// Height and width of the window.
     pub kernel: usize,
-    /// Pixels from one window to the next.
+    /// Stride: pixels from one window to the next.
     pub stride: usize,
-    /// Rows and columns added on each side.
+    /// Padding: rows and columns added on each side.
     pub padding: usize,
 }
 
-/// The mean of each window of each channel of [batch, height, width, channels], without padding.
+/// Average pooling: the mean of each window of each channel of [batch, height, width, channels], without padding.
 #[derive(Clone, Copy, Debug)]
 pub struct AvgPool2d {
     /// Height and width of the window.
     pub kernel: usize,
-    /// Pixels from one window to the next.
+    /// Stride: pixels from one window to the next.
     pub stride: usize,
 }
 

@@ -4,17 +4,17 @@ use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
-/// Adds rows and columns to [batch, height, width, channels], mirrored about the outermost pixels, which are not
+/// Reflection padding: adds rows and columns to [batch, height, width, channels], mirrored about the outermost pixels, which are not
 /// repeated: `c b | a b c d | c b`.
 #[derive(Clone, Copy, Debug)]
 pub struct ReflectPad {
-    /// Columns on the left.
+    /// Columns added on the left.
     pub left: usize,
-    /// Columns on the right.
+    /// Columns added on the right.
     pub right: usize,
-    /// Rows at the top.
+    /// Rows added at the top.
     pub top: usize,
-    /// Rows at the bottom.
+    /// Rows added at the bottom.
     pub bottom: usize,
 }
 

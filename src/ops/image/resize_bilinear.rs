@@ -6,18 +6,18 @@ use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::pool::Buffer;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
-/// [batch, height, width, channels] at another height and width, each pixel interpolated between its four neighbours;
+/// Bilinear resize of [batch, height, width, channels], each pixel interpolated between its four neighbours;
 /// no smoothing when it shrinks.
 ///
 /// Position i of n pixels lies at `(i + 0.5) m / n - 0.5` among m, not below 0 nor above m - 1; with `align_corners` at
 /// `i (m - 1) / (n - 1)`.
 #[derive(Clone, Copy, Debug)]
 pub struct ResizeBilinear {
-    /// The new height.
+    /// Height of the result.
     pub height: usize,
-    /// The new width.
+    /// Width of the result.
     pub width: usize,
-    /// Whether the corner pixels' centres fall on each other.
+    /// Whether the centres of the corner pixels are aligned; pixel centres lie at half numbers otherwise.
     pub align_corners: bool,
 }
 

@@ -6,10 +6,10 @@ use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::simd::{self, copy_run};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
-/// The parts one after the other along dimension `axis`, in which alone they may differ.
+/// Concatenation along dimension `axis`, in which alone the parts may differ.
 #[derive(Clone, Copy, Debug)]
 pub struct Concat {
-    /// The dimension.
+    /// Dimension, from 0.
     pub axis: usize,
     /// Runs handed to a thread at a time, chosen by the shapes by default.
     pub tile: Tile,

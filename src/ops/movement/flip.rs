@@ -5,10 +5,10 @@ use crate::ops::support::put::put_run;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
-/// Dimension `axis` backwards: `y[i] = x[n - 1 - i]`, in the same shape. Along dimension 2 an image is mirrored.
+/// Flip of dimension `axis`: `y[i] = x[n - 1 - i]`, in the same shape. Along dimension 2 an image is mirrored.
 #[derive(Clone, Copy, Debug)]
 pub struct Flip {
-    /// The dimension.
+    /// Dimension, from 0.
     pub axis: usize,
 }
 

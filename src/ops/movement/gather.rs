@@ -5,14 +5,14 @@ use crate::ops::support::indices::countable;
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 
-/// `x`, `index` -> `y` in the shape of the index: along dimension 1 of three, `y[i, j, k] = x[i, index[i, j, k], k]`.
+/// Gather: `x`, `index` -> `y` in the shape of the index: along dimension 1 of three, `y[i, j, k] = x[i, index[i, j, k], k]`.
 ///
 /// The index has as many dimensions as x, and in those other than `axis` it may be smaller: the rest of x is not
 /// looked at. Indices are whole numbers below the extent of the axis, any number of times; they are not differentiated.
 /// Another number panics.
 #[derive(Clone, Copy, Debug)]
 pub struct Gather {
-    /// The dimension.
+    /// Dimension, from 0.
     pub axis: usize,
 }
 

@@ -7,13 +7,13 @@ use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
-/// `x [.., n, ..]`, `index [k]` -> `[.., k, ..]`: `y[.., j, ..] = x[.., index[j], ..]`, along dimension `axis`.
+/// Selection of rows by index: `x [.., n, ..]`, `index [k]` -> `[.., k, ..]`: `y[.., j, ..] = x[.., index[j], ..]`, along dimension `axis`.
 ///
 /// The indices are whole numbers below n, in any order, any number of times; they are not differentiated. Another
 /// number panics.
 #[derive(Clone, Copy, Debug)]
 pub struct IndexSelect {
-    /// The dimension.
+    /// Dimension, from 0.
     pub axis: usize,
 }
 

@@ -5,12 +5,12 @@ use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
-/// The whole of dimension `axis`, `times` over: `[.., n, ..]` -> `[.., n times, ..]`, `y[i] = x[i mod n]`.
+/// Repetition of dimension `axis`, as a whole: `[.., n, ..]` -> `[.., n times, ..]`, `y[i] = x[i mod n]`.
 #[derive(Clone, Copy, Debug)]
 pub struct Repeat {
-    /// The dimension.
+    /// Dimension, from 0.
     pub axis: usize,
-    /// How often.
+    /// Number of repetitions.
     pub times: usize,
 }
 

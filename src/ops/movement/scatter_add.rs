@@ -7,7 +7,7 @@ use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 
-/// `x`, `index`, `values` -> `y` in the shape of x, which is x with the values added where the index points: along
+/// Scatter-add: `x`, `index`, `values` -> `y` in the shape of x, which is x with the values added where the index points: along
 /// dimension 1 of three, `y[i, index[i, j, k], k] += values[i, j, k]`.
 ///
 /// All three have as many dimensions. The index may be smaller than the values, of which only the corner that it covers
@@ -15,7 +15,7 @@ use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 /// several times gets every value. They are not differentiated. Another number panics.
 #[derive(Clone, Copy, Debug)]
 pub struct ScatterAdd {
-    /// The dimension.
+    /// Dimension, from 0.
     pub axis: usize,
 }
 

@@ -3,7 +3,7 @@
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 
-/// The same elements, in the same order, under another shape. Shares the memory.
+/// Reshape: the same elements, in the same order, under another shape. Shares the memory.
 #[derive(Clone, Copy, Debug)]
 pub struct Reshape {
     /// The new shape.
@@ -45,7 +45,7 @@ impl Checked for Reshape {
     }
 }
 
-/// The dimensions in another order: dimension i of the result is dimension `order[i]` of the input.
+/// Permutation of the dimensions: dimension i of the result is dimension `order[i]` of the input.
 #[derive(Clone, Debug)]
 pub struct Permute {
     /// The order.

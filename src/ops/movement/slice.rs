@@ -7,10 +7,10 @@ use crate::ops::support::put::{begin_sum, put_run};
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
-/// The elements `start..end` of dimension `axis`.
+/// Slice `start..end` of dimension `axis`.
 #[derive(Clone, Copy, Debug)]
 pub struct Slice {
-    /// The dimension.
+    /// Dimension, from 0.
     pub axis: usize,
     /// The first index.
     pub start: usize,

@@ -8,13 +8,13 @@ use crate::ops::support::indices::countable;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
-/// The elements along dimension `axis` in order, and (auxiliary) the index where each stood, as a number:
+/// Sort along dimension `axis`: the elements in order, and (auxiliary) the index where each stood, as a number:
 /// `y[j] = x[index[j]]`.
 ///
 /// Stable: equal elements (as 0 and -0 are) keep their order, ascending and descending. NaN comes last either way.
 #[derive(Clone, Copy, Debug)]
 pub struct Sort {
-    /// The dimension.
+    /// Dimension, from 0.
     pub axis: usize,
     /// Whether the largest comes first.
     pub descending: bool,

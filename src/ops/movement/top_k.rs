@@ -13,9 +13,9 @@ use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 /// left it out would hide it.
 #[derive(Clone, Copy, Debug)]
 pub struct TopK {
-    /// The dimension.
+    /// Dimension, from 0.
     pub axis: usize,
-    /// How many.
+    /// Number of elements taken.
     pub k: usize,
     /// Whether the largest, not the smallest.
     pub largest: bool,

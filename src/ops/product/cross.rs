@@ -4,7 +4,7 @@ use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 
-/// `a x b` of vectors of three, the last dimension: `a [.., 3]`, `b [.., 3]` -> `[.., 3]`. No broadcasting.
+/// Cross product `a x b` along the last dimension, of three: `a [.., 3]`, `b [.., 3]` -> `[.., 3]`. No broadcasting.
 #[derive(Clone, Copy, Debug)]
 pub struct Cross;
 

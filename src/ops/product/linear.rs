@@ -12,10 +12,10 @@ use crate::tensor::pool::Buffer;
 use crate::tensor::register_tile::Panels;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
-/// `y [.., out] = x [.., in] w [in, out] (+ b [out])`. A 1x1 convolution is the same thing.
+/// Linear layer: `y [.., out] = x [.., in] w [in, out] (+ b [out])`. A 1x1 convolution is the same thing.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Linear {
-    /// Whether x passes through GELU on its way: `y = gelu(x) w + b`, as in the second half of a transformer's MLP.
+    /// Whether GELU is applied to x first: `y = gelu(x) w + b`, as in the second half of a transformer's MLP.
     /// gelu(x), the widest tensor of a block, is then computed tile by tile and again for the gradient, never kept.
     pub gelu: bool,
     /// Rows handed to a thread at a time.

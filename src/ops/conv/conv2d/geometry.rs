@@ -5,31 +5,31 @@ use crate::ops::ShapeError;
 use crate::ops::Tile;
 use crate::tensor::Shape;
 
-/// What a window sees beyond the edge of the image.
+/// Padding mode: what a window sees beyond the edge of the image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Beyond {
-    /// Zeros.
+    /// Zero padding.
     Zero,
-    /// The image mirrored, without repeating its edge.
+    /// Reflection padding, without repeating the edge.
     Mirrored,
-    /// The pixel at the edge, again and again.
+    /// Replication padding: the nearest pixel of the edge.
     Nearest,
 }
 
-/// How a convolution is computed.
+/// Kernel path of a convolution.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Path {
-    /// One product of matrices: each output sees one pixel.
+    /// A 1x1 window: one product of matrices.
     Pointwise,
-    /// Products of patches that were copied: groups, or a dilation along the row.
+    /// im2col: patches are copied, then multiplied. For groups and for dilations along the row.
     Im2col,
-    /// Products straight from the image's rows.
+    /// Products that read the image's rows in place.
     Direct,
-    /// The same, with so many outputs of a row as one pixel.
+    /// [`Direct`](Path::Direct), with this many neighbouring outputs of a row computed as one pixel.
     SideBySide(usize),
 }
 
-/// Everything about a convolution but its numbers. Pairs are (height, width).
+/// Sizes and attributes of a convolution. Pairs are (height, width).
 #[derive(Clone, Copy, Debug)]
 pub struct Geometry {
     pub(in crate::ops) batch: usize,

@@ -29,21 +29,21 @@ use parts::Part;
 /// which is never made.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Conv2d {
-    /// Stride, (height, width).
+    /// Stride: pixels from one window to the next, (height, width).
     pub stride: [usize; 2],
-    /// Padding on both sides, (height, width).
+    /// Padding: rows and columns added on both sides, (height, width).
     pub padding: [usize; 2],
-    /// Dilation, (height, width).
+    /// Dilation: pixels from one tap of the window to the next, (height, width).
     pub dilation: [usize; 2],
-    /// Channels are cut into so many groups, each convolved for itself.
+    /// Number of groups; each sees in / groups input channels.
     pub groups: usize,
-    /// Of how many inputs, the first ones, the channels are those of x: one after the other. Several are not grouped.
+    /// Number of parts of x: the first so many inputs, whose channels follow one another. Several parts exclude groups.
     pub parts: usize,
-    /// Whether the padding mirrors the image (without repeating its edge) instead of being zero.
+    /// Reflection padding (the edge is not repeated) instead of zero padding.
     pub reflect: bool,
     /// Output rows handed to a thread at a time, chosen by the shapes by default.
     pub tile: Tile,
-    /// What follows, applied to a tile while it is in the cache.
+    /// Activation, applied to each tile of the result while it is in the cache.
     pub activation: Activation,
 }
 
@@ -63,22 +63,22 @@ impl Default for Conv2d {
 }
 
 impl Conv2d {
-    /// Stride 1 and zero padding on all sides.
+    /// A convolution with stride 1 and zero padding on all sides.
     pub fn padded(padding: usize) -> Self {
         Conv2d { padding: [padding; 2], ..Self::default() }
     }
 
-    /// The same, with a stride in both directions.
+    /// This convolution with a stride in both directions.
     pub fn strided(self, stride: usize) -> Self {
         Conv2d { stride: [stride; 2], ..self }
     }
 
-    /// The same, with mirrored padding.
+    /// This convolution with reflection padding.
     pub fn reflecting(self) -> Self {
         Conv2d { reflect: true, ..self }
     }
 
-    /// The same, with an activation behind it.
+    /// This convolution with an activation applied to its result.
     pub fn activated(self, activation: Activation) -> Self {
         Conv2d { activation, ..self }
     }

@@ -15,7 +15,7 @@ use crate::tensor::pool::Buffer;
 use crate::tensor::simd::dispatch_vector;
 use crate::tensor::{Accum, Float, Tensor, parallel};
 
-/// Windows whose size is known to the compiler, and any other.
+/// Kernel path: the windows whose size is known to the compiler, and any other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Path {
     ThreeByThree,
@@ -41,7 +41,7 @@ impl Path {
 /// The images and the window that is moved over them. Pixels outside the image are 0.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Window {
-    /// Images.
+    /// Number of images.
     pub batch: usize,
     /// Height of the input.
     pub height: usize,
@@ -49,9 +49,9 @@ pub(crate) struct Window {
     pub width: usize,
     /// Height and width of the window.
     pub kernel: [usize; 2],
-    /// Pixels from one position of the window to the next.
+    /// Stride: pixels from one window to the next.
     pub stride: usize,
-    /// Rows and columns of zeros on each side.
+    /// Zero padding: rows and columns added on each side.
     pub padding: usize,
 }
 

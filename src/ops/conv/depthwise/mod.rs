@@ -14,13 +14,13 @@ use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 /// where x [batch, height, width, channels] is 0 outside the image; w [kh, kw, channels], b \[channels\].
 #[derive(Clone, Copy, Debug, Default)]
 pub struct DepthwiseConv2d {
-    /// Pixels from one position of the window to the next.
+    /// Stride: pixels from one window to the next.
     pub stride: usize,
-    /// Rows and columns of zeros on each side.
+    /// Zero padding: rows and columns added on each side.
     pub padding: usize,
     /// Rows handed to a thread at a time.
     pub tile: Tile,
-    /// What follows, applied to rows while they are in the cache.
+    /// Activation, applied to rows of the result while they are in the cache.
     pub activation: Activation,
 }
 

@@ -29,7 +29,7 @@ pub struct UpsampledConv2d {
     pub parts: usize,
     /// Rows of x0 handed to a thread at a time, chosen by the shapes by default.
     pub tile: Tile,
-    /// What follows.
+    /// Activation, applied to the result.
     pub activation: Activation,
 }
 
