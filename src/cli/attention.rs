@@ -29,8 +29,8 @@ pub struct Args {
     /// Query pixel: column and row in the picture, from 0 at the upper left.
     #[arg(long, value_name = "X,Y")]
     at: Point,
-    /// Folder for the pictures: NAME_attention.png (the sheet), NAME_saliency.png, and NAME_stageS_pathP_layerL.png, each
-    /// the mean over the heads.
+    /// Folder for the pictures: NAME_attention.png (the sheet), NAME_saliency.png, and NAME_stageS_pathP_layerL.png,
+    /// each the mean over the heads.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Also write every head: NAME_stageS_pathP_layerL_headH.png.

@@ -19,8 +19,8 @@ use super::progress::Progress;
 pub struct Args {
     #[command(flatten)]
     weights: super::weights::WeightsArgs,
-    /// Measure what another program predicted: a .npy file of inverse depths `[frames, height, width]`, up to a factor (not
-    /// the sigmoid), one map for each frame in the order of the split.
+    /// Measure what another program predicted: a .npy file of inverse depths `[frames, height, width]`, up to a factor
+    /// (not the sigmoid), one map for each frame in the order of the split.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["weights", "allow_partial", "height", "width", "flip"])]
     disparities: Option<PathBuf>,
     /// Frames to measure on: `street` (with a seed that no run trains on) or a folder in the layout of KITTI raw.

@@ -28,8 +28,8 @@ pub struct Args {
     /// List of a folder's frames to validate on [default: every tenth training frame is set aside].
     #[arg(long, value_name = "FILE")]
     val_split: Option<PathBuf>,
-    /// Horizontal field of view, in degrees, of the camera that took a folder's pictures [default: from camera.toml among
-    /// the data (width, height, fx, fy, cx, cy in pixels, or fov), or else from the calibration].
+    /// Horizontal field of view, in degrees, of the camera that took a folder's pictures [default: from camera.toml
+    /// among the data (width, height, fx, fy, cx, cy in pixels, or fov), or else from the calibration].
     #[arg(long, value_name = "DEGREES", conflicts_with_all = ["intrinsics", "camera"])]
     fov: Option<f64>,
     /// Focal lengths and principal point of that camera, in pixels of the pictures as they are stored [default: as for
@@ -43,10 +43,12 @@ pub struct Args {
     /// Size of the networks [default: nano, or that of the weights to start from].
     #[arg(long)]
     preset: Option<Preset>,
-    /// Height of the pictures that the networks see, a multiple of 32 [default: 96, or that of the weights to start from].
+    /// Height of the pictures that the networks see, a multiple of 32 [default: 96, or that of the weights to start
+    /// from].
     #[arg(long, value_name = "PIXELS")]
     height: Option<usize>,
-    /// Width of the pictures that the networks see, a multiple of 32 [default: 320, or that of the weights to start from].
+    /// Width of the pictures that the networks see, a multiple of 32 [default: 320, or that of the weights to start
+    /// from].
     #[arg(long, value_name = "PIXELS")]
     width: Option<usize>,
     /// Batch size [default: 4].
@@ -64,8 +66,8 @@ pub struct Args {
     /// Number of passes over the data, instead of --steps.
     #[arg(long, value_name = "N")]
     epochs: Option<u64>,
-    /// Learning rate of the depth decoder; those of the encoder and of the pose networks keep their ratio to it [default:
-    /// 0.001, or 0.0001 where training starts from weights].
+    /// Learning rate of the depth decoder; those of the encoder and of the pose networks keep their ratio to it
+    /// [default: 0.001, or 0.0001 where training starts from weights].
     #[arg(long, value_name = "RATE")]
     learning_rate: Option<f64>,
     /// Seed of everything random [default: 0].
@@ -88,8 +90,8 @@ pub struct Args {
     /// Start from those weights that fit, and list the others.
     #[arg(long)]
     allow_partial: bool,
-    /// Pass over samples with a frame that cannot be read, and say at the end how many they were [default: the first one
-    /// ends the run].
+    /// Pass over samples with a frame that cannot be read, and say at the end how many they were [default: the first
+    /// one ends the run].
     #[arg(long)]
     skip_bad_frames: bool,
     /// Continue this run: an interrupted one, or with --steps a finished one.
@@ -304,8 +306,8 @@ fn print_metrics(m: &RunMetrics, start: &str) {
 }
 
 impl Args {
-    /// Of a run that goes on, only where its data are, how many steps it takes and whether bad frames are passed over can
-    /// be said anew.
+    /// Of a run that goes on, only where its data are, how many steps it takes and whether bad frames are passed over
+    /// can be said anew.
     fn refuse_what_cannot_change(&self) -> Result<()> {
         let given = [
             ("--height", self.height.is_some()),

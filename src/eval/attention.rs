@@ -2,14 +2,15 @@
 //!
 //! Factorised attention ([`FactorisedAttention`](crate::ops::attention::factorised::FactorisedAttention)) never forms a
 //! matrix of tokens by tokens: with q, k, v `[N, c]` of one head it computes `c^(-1/2) q (softmax(k)^T v)`, the softmax
-//! over the N tokens, channel by channel. Bracketed the other way it is a matrix after all, and token i has a row of it:
+//! over the N tokens, channel by channel. Bracketed the other way it is a matrix after all, and token i has a row of
+//! it:
 //!
 //! ```text
 //! out_i = Σ_j a_ij v_j    with    a_ij = c^(-1/2) Σ_γ q_iγ p_jγ    and    p_jγ = exp(k_jγ) / Σ_t exp(k_tγ)
 //! ```
 //!
-//! These weights are signed, because q is: they need be neither positive nor sum to 1 (a row sums to `c^(-1/2) Σ_γ q_iγ`,
-//! since every column of p sums to 1). A negative weight takes the value of that token away.
+//! These weights are signed, because q is: they need be neither positive nor sum to 1 (a row sums to `c^(-1/2) Σ_γ
+//! q_iγ`, since every column of p sums to 1). A negative weight takes the value of that token away.
 //!
 //! The convolutional relative position encoding, which is added to this output, is left out: it multiplies q with a
 //! window of 3, 5 or 7 tokens around it, with other weights in every channel, and so has no row that a head shares.

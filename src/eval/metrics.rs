@@ -264,7 +264,8 @@ pub fn median(mut values: Vec<f64>) -> Option<f64> {
 
 /// Flip post-processing: joins the prediction `left` of an image with `right`, the prediction of the mirrored image
 /// mirrored back; rows of `width` values. Either is trusted least at the border where its own disocclusions lie: at
-/// the left border the result is `right`, at the right border `left`, within 5 % it fades, and in between it is their mean.
+/// the left border the result is `right`, at the right border `left`, within 5 % it fades, and in between it is their
+/// mean.
 ///
 /// # Panics
 /// If the maps differ in length or are not rows of `width`.

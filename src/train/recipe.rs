@@ -1,7 +1,7 @@
 //! The recipe of a run: everything that decides it, as `config.toml` holds it.
 //!
-//! What belongs to the beginning of a training (warm-up, rotations, the delay of auto-masking) is a share of its steps, so
-//! that a recipe can be given another number of steps. [`RunConfig::plan`] turns the shares into steps.
+//! What belongs to the beginning of a training (warm-up, rotations, the delay of auto-masking) is a share of its steps,
+//! so that a recipe can be given another number of steps. [`RunConfig::plan`] turns the shares into steps.
 
 use std::path::{Path, PathBuf};
 
@@ -230,8 +230,8 @@ pub struct RunConfig {
     pub log_every: u64,
     /// The whole state is written, and the weights are validated, every so many steps.
     pub checkpoint_every: u64,
-    /// The share of the steps before auto-masking sets in. While the motion is not known yet, a warped neighbour explains
-    /// hardly any pixel better than an unwarped one, and masking would leave little to learn from.
+    /// The share of the steps before auto-masking sets in. While the motion is not known yet, a warped neighbour
+    /// explains hardly any pixel better than an unwarped one, and masking would leave little to learn from.
     pub auto_mask_delay: f64,
     /// The parts that are taken away from the named sizes.
     #[serde(default)]
@@ -293,8 +293,8 @@ impl RunConfig {
         }
     }
 
-    /// The recipe for a start from trained weights: the published learning rates (MonoViT, section 4.1), pictures of the
-    /// weights' own size, and nothing of what random weights need.
+    /// The recipe for a start from trained weights: the published learning rates (MonoViT, section 4.1), pictures of
+    /// the weights' own size, and nothing of what random weights need.
     pub fn from_weights(setup: Setup, steps: u64) -> Self {
         let Setup { preset, ablation, height, width, min_depth, max_depth } = setup;
         let scratch = Self::new(preset, steps);
@@ -385,8 +385,8 @@ fn none_one_or_many<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result
     })
 }
 
-/// Reads a configuration: a run's `config.toml`, or part of one; what it does not say is as in [`RunConfig::new`] of its
-/// preset.
+/// Reads a configuration: a run's `config.toml`, or part of one; what it does not say is as in [`RunConfig::new`] of
+/// its preset.
 ///
 /// # Errors
 /// Names the file, and the line where a value cannot be used.

@@ -1,8 +1,8 @@
 //! `parallax bench roofline`: what each op reaches of what this machine could do with it.
 //!
 //! An op cannot be faster than its arithmetic at the speed of a large matrix product, nor than its least memory traffic
-//! at the speed of a large copy (Williams, Waterman and Patterson, Roofline, 2009). Both ceilings are measured here, now.
-//! Data that is still in a cache comes faster than from memory: small ops can exceed the second ceiling.
+//! at the speed of a large copy (Williams, Waterman and Patterson, Roofline, 2009). Both ceilings are measured here,
+//! now. Data that is still in a cache comes faster than from memory: small ops can exceed the second ceiling.
 
 use std::time::Instant;
 

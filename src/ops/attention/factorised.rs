@@ -8,8 +8,8 @@ use crate::tensor::gemm::Rows;
 use crate::tensor::pool::Buffer;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
-/// Factorised attention: `out = c^(-1/2) q (softmax(k)^T v)` for each head of c channels, the softmax over the tokens (Xu et al. 2021,
-/// 2104.06399, equation 6).
+/// Factorised attention: `out = c^(-1/2) q (softmax(k)^T v)` for each head of c channels, the softmax over the tokens
+/// (Xu et al. 2021, 2104.06399, equation 6).
 ///
 /// The input [batch, tokens, 3 C] holds q, k and v beside each other, each head-major; the result is
 /// [batch, tokens, C]. Nothing as large as a token map is stored between the passes: the first sums unnormalised

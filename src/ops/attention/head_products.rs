@@ -1,4 +1,5 @@
-//! Products head by head, on tokens whose channels lie head-major: the two shapes of product that attention consists of.
+//! Products head by head, on tokens whose channels lie head-major: the two shapes of product that attention consists
+//! of.
 //!
 //! A head is a handful of channels, too few for a general matrix product: it packs and pads for longer than it
 //! multiplies. Heads of up to [`LANES`] channels are instead computed in windows of [`LANES`] neighbouring channels,

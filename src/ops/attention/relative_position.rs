@@ -8,8 +8,8 @@ use crate::tensor::pool::Buffer;
 use crate::tensor::simd::copy_run;
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
-/// Convolutional relative position encoding: `out = q * (depthwise convolution of v as an image)`, with windows of several sizes, each over its own heads (Xu et
-/// al. 2021, 2104.06399, section 3.3). Zero padding half the window.
+/// Convolutional relative position encoding: `out = q * (depthwise convolution of v as an image)`, with windows of
+/// several sizes, each over its own heads (Xu et al. 2021, 2104.06399, section 3.3). Zero padding half the window.
 ///
 /// Inputs: qkv [batch, height * width, 3 C], q, k and v side by side; then for every window, over the next heads in
 /// order, a weight [window, window, channels of those heads] and a bias [those channels]. The result is

@@ -1,4 +1,5 @@
-//! Transposed 2-D convolution: the gradient of a convolution as a forward pass, which spreads every pixel over a window.
+//! Transposed 2-D convolution: the gradient of a convolution as a forward pass, which spreads every pixel over a
+//! window.
 
 use super::conv2d::geometry::{Beyond, Geometry};
 use super::conv2d::kernel;
@@ -11,12 +12,12 @@ use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 
 /// `x [batch, height, width, in]`, `w [kh, kw, out / groups, in]`, optionally `b [out]`
-/// -> `[batch, (height - 1) stride - 2 padding + dilation (kh - 1) + output padding + 1, ..., out]`: pixel i times tap k
-/// of the window is added to pixel `i stride + k dilation - padding`.
+/// -> `[batch, (height - 1) stride - 2 padding + dilation (kh - 1) + output padding + 1, ..., out]`: pixel i times tap
+/// k of the window is added to pixel `i stride + k dilation - padding`.
 ///
-/// It is the transpose of a [`Conv2d`](crate::ops::Conv2d) from `out` to `in` channels, with the same weights as they lie:
-/// `<conv2d(y, w), x> = <y, conv_transpose2d(x, w)>`. PyTorch's weights `[in, out / groups, kh, kw]` become these by the
-/// permutation `[2, 3, 1, 0]`.
+/// It is the transpose of a [`Conv2d`](crate::ops::Conv2d) from `out` to `in` channels, with the same weights as they
+/// lie: `<conv2d(y, w), x> = <y, conv_transpose2d(x, w)>`. PyTorch's weights `[in, out / groups, kh, kw]` become these
+/// by the permutation `[2, 3, 1, 0]`.
 ///
 /// With a stride, images of several sizes are convolved to one size; the output padding says to which of them the
 /// transpose goes back. It adds rows and columns at the end, which the window may reach.
@@ -138,8 +139,9 @@ impl<T: Float> Op<T> for ConvTranspose2d {
         (vec![y], (needs.get(1).then(|| x.clone()), needs.get(0).then(|| w.clone()), g))
     }
 
-    /// y = C^T x + b, where C is the matrix of the convolution, so dx = C dy: the convolution of dy. And y . dy = x . C dy:
-    /// dw is that of a convolution whose input is dy and whose output has the gradient x. db = sum over pixels of dy.
+    /// y = C^T x + b, where C is the matrix of the convolution, so dx = C dy: the convolution of dy. And y . dy = x . C
+    /// dy: dw is that of a convolution whose input is dy and whose output has the gradient x. db = sum over pixels of
+    /// dy.
     fn backward(&self, (x, w, g): Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
         let dy = upstream.only();
         if let Some(w) = w {
@@ -239,8 +241,8 @@ impl Checked for ConvTranspose2d {
 }
 
 impl<T: Float> Var<T> {
-    /// Transposed 2-D convolution of an image `[batch, height, width, in]` with `weight [kh, kw, out / groups, in]` and a
-    /// bias `[out]`.
+    /// Transposed 2-D convolution of an image `[batch, height, width, in]` with `weight [kh, kw, out / groups, in]` and
+    /// a bias `[out]`.
     #[track_caller]
     pub fn conv_transpose2d(&self, weight: &Self, bias: Option<&Self>, op: ConvTranspose2d) -> Self {
         match bias {

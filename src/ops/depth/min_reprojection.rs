@@ -6,8 +6,8 @@ use crate::ops::support::sums::pairwise_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
-/// Minimum reprojection: the mean over pixels of the minimum over `candidates`, one or more tensors of one shape; and (auxiliary) the index of
-/// the winner of each pixel, in that shape.
+/// Minimum reprojection: the mean over pixels of the minimum over `candidates`, one or more tensors of one shape; and
+/// (auxiliary) the index of the winner of each pixel, in that shape.
 ///
 /// With the unwarped sources among the candidates this is the auto-mask: a pixel that one of them wins has no gradient
 /// to give. Of several equal candidates the first wins. A NaN wins, so that the mean shows it.
@@ -110,8 +110,8 @@ impl Checked for MinReprojection {
 }
 
 impl<T: Float> Var<T> {
-    /// The mean over pixels of the smallest of the candidates (each `[batch, height, width, 1]`), a scalar; and the index
-    /// of the winner of each pixel, of the candidates' shape. The first of equal ones wins, and a NaN wins.
+    /// The mean over pixels of the smallest of the candidates (each `[batch, height, width, 1]`), a scalar; and the
+    /// index of the winner of each pixel, of the candidates' shape. The first of equal ones wins, and a NaN wins.
     #[track_caller]
     pub fn min_reprojection(candidates: &[&Self]) -> (Self, Tensor<T>) {
         let [mean, winner] = apply(MinReprojection::default(), candidates).try_into().ok().expect("two outputs");

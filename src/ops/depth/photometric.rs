@@ -5,8 +5,9 @@ use crate::ops::Tile;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 
-/// Photometric error `w mean_c clamp((1 - SSIM) / 2, 0, 1) + (1 - w) mean_c |prediction - target|` for every pixel: from two images
-/// `[batch, height, width, channels]` to `[batch, height, width, 1]`. With w = 0 the structural part is not computed.
+/// Photometric error `w mean_c clamp((1 - SSIM) / 2, 0, 1) + (1 - w) mean_c |prediction - target|` for every pixel:
+/// from two images `[batch, height, width, channels]` to `[batch, height, width, 1]`. With w = 0 the structural part is
+/// not computed.
 ///
 /// The derivative of |0| is 0; for the clamp see [`SsimLoss`](super::ssim::SsimLoss).
 #[derive(Clone, Copy, Debug)]
@@ -91,8 +92,8 @@ impl Checked for Photometric {
 }
 
 impl<T: Float> Var<T> {
-    /// The photometric loss `[batch, height, width, 1]` of this prediction against a target, both `[batch, height, width,
-    /// channels]`: structural dissimilarity with weight `ssim_weight`, mean absolute difference with the rest.
+    /// The photometric loss `[batch, height, width, 1]` of this prediction against a target, both `[batch, height,
+    /// width, channels]`: structural dissimilarity with weight `ssim_weight`, mean absolute difference with the rest.
     #[track_caller]
     pub fn photometric(&self, target: &Self, ssim_weight: f64) -> Self {
         apply1(Photometric { ssim_weight, tile: Tile::AUTO }, &[self, target])

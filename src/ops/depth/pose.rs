@@ -5,8 +5,8 @@ use crate::ops::support::put::put_rounded;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 
-/// Rigid transform `[R | t]` as `[batch, 3, 4]`, from axis-angle `[batch, 3]` and translation `[batch, 3]`; or its inverse
-/// `[R^T | -R^T t]`.
+/// Rigid transform `[R | t]` as `[batch, 3, 4]`, from axis-angle `[batch, 3]` and translation `[batch, 3]`; or its
+/// inverse `[R^T | -R^T t]`.
 #[derive(Clone, Copy, Debug)]
 pub struct PoseMatrix {
     /// Whether the result is the inverse transform.

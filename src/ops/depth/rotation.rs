@@ -4,8 +4,8 @@ use crate::ops::support::put::put_rounded;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 
-/// Rotation matrix of an axis-angle vector: `R [batch, 3, 3] = exp([v]x)` of `v [batch, 3]`, by Rodrigues' formula `I + a [v]x + b [v]x^2` with
-/// `a = sin t / t`, `b = (1 - cos t) / t^2`, `t = |v|`.
+/// Rotation matrix of an axis-angle vector: `R [batch, 3, 3] = exp([v]x)` of `v [batch, 3]`, by Rodrigues' formula `I +
+/// a [v]x + b [v]x^2` with `a = sin t / t`, `b = (1 - cos t) / t^2`, `t = |v|`.
 ///
 /// It is computed in f64 for either element type: there are few of them, and one switch to the series serves both.
 #[derive(Clone, Copy, Debug)]

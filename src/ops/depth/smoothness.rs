@@ -1,5 +1,5 @@
-//! Edge-aware smoothness of a disparity, in one op (Godard et al., 1609.03677, with the mean normalisation of Wang et al.,
-//! 1712.00175).
+//! Edge-aware smoothness of a disparity, in one op (Godard et al., 1609.03677, with the mean normalisation of Wang et
+//! al., 1712.00175).
 
 use crate::ops::support::put::{begin_sum, put};
 use crate::ops::support::sums::pairwise_sum;
@@ -9,8 +9,9 @@ use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, poo
 /// Guards the division by the mean disparity, as published.
 const EPSILON: f64 = 1e-7;
 
-/// Edge-aware smoothness. With `D = disparity / (mean over h, w + 1e-7)`: the mean of `|D_x+1 - D_x| exp(-mean_c |I_x+1 - I_x|)`, plus the same
-/// in y. Disparity `[batch, height, width, 1]`, image `[batch, height, width, channels]`, to a scalar.
+/// Edge-aware smoothness. With `D = disparity / (mean over h, w + 1e-7)`: the mean of `|D_x+1 - D_x| exp(-mean_c |I_x+1
+/// - I_x|)`, plus the same in y. Disparity `[batch, height, width, 1]`, image `[batch, height, width, channels]`, to a
+/// scalar.
 ///
 /// The derivative of |0| is 0, in the disparity and in the image.
 #[derive(Clone, Copy, Debug)]
@@ -114,9 +115,9 @@ impl<T: Float> Op<T> for Smoothness {
         (vec![Tensor::scalar(loss)], saved)
     }
 
-    /// L = sum over samples of S / m, with m the mean and S the sum of |d' - d| e over both directions. A disparity gets
-    /// e sign(d' - d) / m as d', the opposite as d, and -S / m^2 / (h w) through the mean. An image's channel gets, of
-    /// the edge weight e = exp(-mean_c |I' - I|), -|d' - d| e / m sign(I' - I) / c as I', the opposite as I.
+    /// L = sum over samples of S / m, with m the mean and S the sum of |d' - d| e over both directions. A disparity
+    /// gets e sign(d' - d) / m as d', the opposite as d, and -S / m^2 / (h w) through the mean. An image's channel
+    /// gets, of the edge weight e = exp(-mean_c |I' - I|), -|d' - d| e / m sign(I' - I) / c as I', the opposite as I.
     fn backward(&self, saved: Saved<T>, upstream: Upstream<T>, sink: &mut GradSink<T>) {
         let g = upstream.only().item();
         let Saved { disparity, image, edges, samples } = saved;

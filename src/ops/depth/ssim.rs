@@ -1,7 +1,7 @@
 //! Structural similarity (Wang et al., 2004) as a loss, and the kernels that the photometric loss shares with it.
 //!
-//! Images are worked on row by row. The 3x3 means are separable: sums over three rows first, written into a row with one
-//! pixel more at either end (mirrored), then over three neighbours; every loop runs over all of a row's pixels and
+//! Images are worked on row by row. The 3x3 means are separable: sums over three rows first, written into a row with
+//! one pixel more at either end (mirrored), then over three neighbours; every loop runs over all of a row's pixels and
 //! channels at once. Nothing but the inputs is saved: the backward pass forms the means again, which costs less than
 //! writing and reading them as images.
 
@@ -13,8 +13,8 @@ use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parall
 const C1: f64 = 0.01 * 0.01;
 const C2: f64 = 0.03 * 0.03;
 
-/// Structural dissimilarity `clamp((1 - SSIM) / 2, 0, 1)` of x and y `[batch, height, width, channels]`, per channel: means over 3x3 windows of the
-/// images, reflected by one pixel at the edges; `C1 = 0.01^2`, `C2 = 0.03^2`.
+/// Structural dissimilarity `clamp((1 - SSIM) / 2, 0, 1)` of x and y `[batch, height, width, channels]`, per channel:
+/// means over 3x3 windows of the images, reflected by one pixel at the edges; `C1 = 0.01^2`, `C2 = 0.03^2`.
 ///
 /// SSIM lies within [-1, 1], so the clamp only catches rounding: its derivative is 1 on the bounds and 0 beyond.
 #[derive(Clone, Copy, Debug, Default)]
@@ -184,9 +184,10 @@ impl Kernel {
 
     /// The gradient by `x`; by symmetry also that by `y`, with the two exchanged. `g` has the result's channels.
     ///
-    /// SSIM depends on x through the window means of x, x^2 + y^2 and x y. With s = n1 n2 / D, D = d1 d2, its derivatives
-    /// by them are A = 2 y' (n2 - n1) / D + 2 x' s (1/d2 - 1/d1) (primes are means), Q = -s / d2 and P = 2 n1 / D. A pixel
-    /// gets A + 2 x Q + y P summed over the windows that hold it (twice where reflection puts it there twice), over 9.
+    /// SSIM depends on x through the window means of x, x^2 + y^2 and x y. With s = n1 n2 / D, D = d1 d2, its
+    /// derivatives by them are A = 2 y' (n2 - n1) / D + 2 x' s (1/d2 - 1/d1) (primes are means), Q = -s / d2 and P = 2
+    /// n1 / D. A pixel gets A + 2 x Q + y P summed over the windows that hold it (twice where reflection puts it there
+    /// twice), over 9.
     pub fn backward<T: Float>(&self, x: &Tensor<T>, y: &Tensor<T>, g: &Tensor<T>, out: &mut [T], accum: Accum) {
         let [_, height, width, channels] = x.shape().nhwc().expect("checked by the shape rule");
         let n = width * channels;

@@ -12,12 +12,13 @@ use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parall
 /// Guards the division by the projected depth, as published.
 const EPSILON: f64 = 1e-7;
 
-/// View synthesis: `source [batch, height, width, channels]` seen from the target camera, given the target's `depth [batch, height,
-/// width, 1]` and the rigid `transform [batch, 3, 4]` from target to source camera.
+/// View synthesis: `source [batch, height, width, channels]` seen from the target camera, given the target's `depth
+/// [batch, height, width, 1]` and the rigid `transform [batch, 3, 4]` from target to source camera.
 ///
-/// Pixel (u, v, 1) -> K^-1 -> times depth -> transform -> K -> divided by (z + 1e-7) -> sampled bilinearly. Outside, the
-/// nearest edge pixel; there, and on the centres of the outermost pixels, the gradient by depth and transform is 0. What
-/// lies behind the camera is projected through it like the rest. Places may be infinite (they clamp); NaN gives NaN.
+/// Pixel (u, v, 1) -> K^-1 -> times depth -> transform -> K -> divided by (z + 1e-7) -> sampled bilinearly. Outside,
+/// the nearest edge pixel; there, and on the centres of the outermost pixels, the gradient by depth and transform is 0.
+/// What lies behind the camera is projected through it like the rest. Places may be infinite (they clamp); NaN gives
+/// NaN.
 #[derive(Clone, Debug)]
 pub struct Warp {
     /// Focal lengths and principal point of every sample, in pixels: fx, fy, cx, cy.

@@ -15,9 +15,9 @@ pub enum GridPadding {
     Reflection,
 }
 
-/// Bilinear sampling at given places. `y [batch, h, w, channels]`: `x [batch, height, width, channels]` at the places `grid [batch, h, w, 2]`, each an
-/// (x, y) with -1 and 1 at the left and right (top and bottom) of the image: at the centres of the outermost pixels if
-/// corners are aligned, else at their outer edges.
+/// Bilinear sampling at given places. `y [batch, h, w, channels]`: `x [batch, height, width, channels]` at the places
+/// `grid [batch, h, w, 2]`, each an (x, y) with -1 and 1 at the left and right (top and bottom) of the image: at the
+/// centres of the outermost pixels if corners are aligned, else at their outer edges.
 ///
 /// Any coordinate is safe. An infinite one lies outside (reflected, it has no place and gives NaN); a NaN gives NaN.
 /// At whole pixels the gradient by the grid is that of the cell to the right (below). With `Border` and `Reflection` a

@@ -4,8 +4,8 @@ use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
-/// Max pooling: the largest element of each window of each channel of [batch, height, width, channels]. Padding never wins, a NaN
-/// does. Of several equal ones the first, row by row, gets the gradient.
+/// Max pooling: the largest element of each window of each channel of [batch, height, width, channels]. Padding never
+/// wins, a NaN does. Of several equal ones the first, row by row, gets the gradient.
 #[derive(Clone, Copy, Debug)]
 pub struct MaxPool2d {
     /// Height and width of the window.

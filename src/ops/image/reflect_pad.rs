@@ -4,8 +4,8 @@ use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
-/// Reflection padding: adds rows and columns to [batch, height, width, channels], mirrored about the outermost pixels, which are not
-/// repeated: `c b | a b c d | c b`.
+/// Reflection padding: adds rows and columns to [batch, height, width, channels], mirrored about the outermost pixels,
+/// which are not repeated: `c b | a b c d | c b`.
 #[derive(Clone, Copy, Debug)]
 pub struct ReflectPad {
     /// Columns added on the left.

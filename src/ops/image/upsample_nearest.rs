@@ -5,7 +5,8 @@ use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::simd::copy_run;
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
 
-/// Nearest-neighbour upsampling: every pixel of [batch, height, width, channels] becomes a square of `scale` x `scale` pixels.
+/// Nearest-neighbour upsampling: every pixel of [batch, height, width, channels] becomes a square of `scale` x `scale`
+/// pixels.
 #[derive(Clone, Copy, Debug)]
 pub struct UpsampleNearest {
     /// Factor in both directions.

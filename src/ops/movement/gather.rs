@@ -5,7 +5,8 @@ use crate::ops::support::indices::countable;
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 
-/// Gather: `x`, `index` -> `y` in the shape of the index: along dimension 1 of three, `y[i, j, k] = x[i, index[i, j, k], k]`.
+/// Gather: `x`, `index` -> `y` in the shape of the index: along dimension 1 of three, `y[i, j, k] = x[i, index[i, j,
+/// k], k]`.
 ///
 /// The index has as many dimensions as x, and in those other than `axis` it may be smaller: the rest of x is not
 /// looked at. Indices are whole numbers below the extent of the axis, any number of times; they are not differentiated.
@@ -77,8 +78,8 @@ impl Checked for Gather {
 }
 
 impl<T: Float> Var<T> {
-    /// Elements along dimension `axis`, each chosen by an index of its own; the result has the shape of the index, which
-    /// beside the axis may be smaller than this.
+    /// Elements along dimension `axis`, each chosen by an index of its own; the result has the shape of the index,
+    /// which beside the axis may be smaller than this.
     ///
     /// # Panics
     /// If an index is not a whole number below the extent of the axis.

@@ -7,7 +7,8 @@ use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
-/// Selection of rows by index: `x [.., n, ..]`, `index [k]` -> `[.., k, ..]`: `y[.., j, ..] = x[.., index[j], ..]`, along dimension `axis`.
+/// Selection of rows by index: `x [.., n, ..]`, `index [k]` -> `[.., k, ..]`: `y[.., j, ..] = x[.., index[j], ..]`,
+/// along dimension `axis`.
 ///
 /// The indices are whole numbers below n, in any order, any number of times; they are not differentiated. Another
 /// number panics.

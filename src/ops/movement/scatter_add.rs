@@ -7,12 +7,12 @@ use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply1};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 
-/// Scatter-add: `x`, `index`, `values` -> `y` in the shape of x, which is x with the values added where the index points: along
-/// dimension 1 of three, `y[i, index[i, j, k], k] += values[i, j, k]`.
+/// Scatter-add: `x`, `index`, `values` -> `y` in the shape of x, which is x with the values added where the index
+/// points: along dimension 1 of three, `y[i, index[i, j, k], k] += values[i, j, k]`.
 ///
 /// All three have as many dimensions. The index may be smaller than the values, of which only the corner that it covers
-/// is added, and beside `axis` smaller than x. Indices are whole numbers below x's extent along the axis; what they name
-/// several times gets every value. They are not differentiated. Another number panics.
+/// is added, and beside `axis` smaller than x. Indices are whole numbers below x's extent along the axis; what they
+/// name several times gets every value. They are not differentiated. Another number panics.
 #[derive(Clone, Copy, Debug)]
 pub struct ScatterAdd {
     /// Dimension, from 0.
@@ -51,8 +51,8 @@ impl<T: Float> Op<T> for ScatterAdd {
         (vec![y], (index.clone(), *values.shape()))
     }
 
-    /// y is a sum, so dx = dy, and each value that was added gets the gradient of the place it was added to. Values that
-    /// the index does not cover get nothing.
+    /// y is a sum, so dx = dy, and each value that was added gets the gradient of the place it was added to. Values
+    /// that the index does not cover get nothing.
     fn backward(&self, (index, values): Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
         let g = upstream.only();
         sink.accumulate(2, |out, accum| {

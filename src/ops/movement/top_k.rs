@@ -6,8 +6,8 @@ use crate::ops::support::indices::countable;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 
-/// The `k` largest (or smallest) elements along dimension `axis`, `[.., n, ..]` -> `[.., k, ..]`, the furthest out first,
-/// and (auxiliary) the index where each stood, as a number.
+/// The `k` largest (or smallest) elements along dimension `axis`, `[.., n, ..]` -> `[.., k, ..]`, the furthest out
+/// first, and (auxiliary) the index where each stood, as a number.
 ///
 /// Of equal elements the earlier comes first, and is the one that is chosen. A NaN wins, as in a maximum: a choice that
 /// left it out would hide it.
@@ -89,8 +89,8 @@ impl Checked for TopK {
 }
 
 impl<T: Float> Var<T> {
-    /// The `k` largest (or smallest) elements along dimension `axis`, the furthest out first, and the indices where they
-    /// stood (as numbers): `[.., n, ..]` -> twice `[.., k, ..]`.
+    /// The `k` largest (or smallest) elements along dimension `axis`, the furthest out first, and the indices where
+    /// they stood (as numbers): `[.., n, ..]` -> twice `[.., k, ..]`.
     #[track_caller]
     pub fn top_k(&self, axis: usize, k: usize, largest: bool) -> [Self; 2] {
         apply(TopK { axis, k, largest }, &[self]).try_into().ok().expect("two outputs")

@@ -4,7 +4,8 @@ use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::gemm::{Rows, RowsMut, gemm};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
-/// Matrix product `[.., m, k] x [.., k, n] -> [.., m, n]`, one product for each matrix of the leading dimensions, which are equal.
+/// Matrix product `[.., m, k] x [.., k, n] -> [.., m, n]`, one product for each matrix of the leading dimensions, which
+/// are equal.
 #[derive(Clone, Copy, Debug)]
 pub struct Matmul;
 

@@ -1,8 +1,9 @@
 //! Convolution without an im2col matrix: windows are read from padded rows of the image where they lie.
 //!
-//! A row of the image with its padding is copied once, from all its parts; the windows of the output pixels of a row are then runs of it,
-//! a stride apart, for each row of the window. That is a product whose left operand needs no memory of its own
-//! ([`register_tile`](crate::tensor::register_tile)), where im2col writes every number as often as windows overlap.
+//! A row of the image with its padding is copied once, from all its parts; the windows of the output pixels of a row
+//! are then runs of it, a stride apart, for each row of the window. That is a product whose left operand needs no
+//! memory of its own ([`register_tile`](crate::tensor::register_tile)), where im2col writes every number as often as
+//! windows overlap.
 
 use std::ops::Range;
 

@@ -1,9 +1,9 @@
 //! 2-D convolution: windows times weights. A 1x1 convolution is a product of the pixels as they lie.
 //!
-//! In this layout the window of one output pixel is `kernel height` contiguous runs of `kernel width * channels` numbers.
-//! `direct` multiplies these runs where they lie in a padded row; grouped convolutions, and those dilated along the row,
-//! whose windows are not whole runs, are copied into an im2col matrix in tiles that fit the cache (`kernel`). Reflection
-//! padding is a matter of what is copied, and costs nothing.
+//! In this layout the window of one output pixel is `kernel height` contiguous runs of `kernel width * channels`
+//! numbers. `direct` multiplies these runs where they lie in a padded row; grouped convolutions, and those dilated
+//! along the row, whose windows are not whole runs, are copied into an im2col matrix in tiles that fit the cache
+//! (`kernel`). Reflection padding is a matter of what is copied, and costs nothing.
 
 pub(in crate::ops) mod direct;
 pub(in crate::ops) mod geometry;
@@ -23,10 +23,11 @@ use parts::Part;
 /// `x [batch, height, width, in]`, `w [kh, kw, in / groups, out]`, optionally `b [out]`
 /// -> `[batch, (height + 2 padding - dilation (kh - 1) - 1) / stride + 1, ..., out]`.
 ///
-/// A cross-correlation, as everywhere in deep learning, and an activation if one is set. Depthwise convolution has an op of its own.
+/// A cross-correlation, as everywhere in deep learning, and an activation if one is set. Depthwise convolution has an
+/// op of its own.
 ///
-/// x may come in several `parts`, inputs `x_1 .. x_n, w (, b)`: the convolution of their concatenation along the channels,
-/// which is never made.
+/// x may come in several `parts`, inputs `x_1 .. x_n, w (, b)`: the convolution of their concatenation along the
+/// channels, which is never made.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Conv2d {
     /// Stride: pixels from one window to the next, (height, width).
@@ -370,7 +371,8 @@ impl Checked for Conv2d {
 }
 
 impl<T: Float> Var<T> {
-    /// 2-D convolution of the concatenation along the channels of images `[batch, height, width, ..]`, which is not made.
+    /// 2-D convolution of the concatenation along the channels of images `[batch, height, width, ..]`, which is not
+    /// made.
     ///
     /// # Panics
     /// If the images differ in more than channels, or the weights do not fit.

@@ -1,8 +1,8 @@
 //! The kernels: convolution of each channel with its own window, over channels that lie side by side.
 //!
-//! They work on [`Rows`], one row a pixel, so that a range of channels of a wider tensor (the values among queries, keys
-//! and values) is convolved where it lies. Channels go in blocks of one vector register; the last block overlaps the one
-//! before it where the count is no multiple, and only its new channels are written.
+//! They work on [`Rows`], one row a pixel, so that a range of channels of a wider tensor (the values among queries,
+//! keys and values) is convolved where it lies. Channels go in blocks of one vector register; the last block overlaps
+//! the one before it where the count is no multiple, and only its new channels are written.
 
 use std::ops::Range;
 
@@ -420,8 +420,8 @@ impl<T: Float> GatherLine<'_, T> {
         }
     }
 
-    /// A window of 3 x 3 with stride 2: of each pair of columns the even one meets the outer taps of two outputs, the odd
-    /// one the middle tap of one. `rows`: the rows of the output that meet this one, each with its row of taps.
+    /// A window of 3 x 3 with stride 2: of each pair of columns the even one meets the outer taps of two outputs, the
+    /// odd one the middle tap of one. `rows`: the rows of the output that meet this one, each with its row of taps.
     #[inline(always)]
     fn pairs<S: Simd, const PART: bool, const R: usize>(
         &self,
@@ -476,8 +476,8 @@ impl<T: Float> GatherLine<'_, T> {
     }
 }
 
-/// `dw = ` the gradient of the weight, or `dw += ...`, in a fixed number of partial sums over bands of rows, added up in
-/// order: the same bits for any number of threads.
+/// `dw = ` the gradient of the weight, or `dw += ...`, in a fixed number of partial sums over bands of rows, added up
+/// in order: the same bits for any number of threads.
 ///
 /// `tile`: rows of the output in a partial sum.
 pub(crate) fn weight_gradient<T: Float>(

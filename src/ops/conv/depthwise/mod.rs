@@ -85,8 +85,8 @@ impl<T: Float> Op<T> for DepthwiseConv2d {
         (vec![y], (needs.get(1).then(|| x.clone()), needs.get(0).then(|| w.clone()), [*x.shape(), *w.shape()], kept))
     }
 
-    /// With i = o stride + k - padding: dx\[i\] = sum over those k, o of dy\[o\] w\[k\]; dw\[k\] = sum over o of x\[i\] dy\[o\];
-    /// db = the sum of dy's pixels.
+    /// With i = o stride + k - padding: dx\[i\] = sum over those k, o of dy\[o\] w\[k\]; dw\[k\] = sum over o of x\[i\]
+    /// dy\[o\]; db = the sum of dy's pixels.
     ///
     /// An activation turns dy into the gradient of its argument first.
     fn backward(&self, (x, w, shapes, kept): Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
@@ -165,8 +165,8 @@ impl Checked for DepthwiseConv2d {
 }
 
 impl<T: Float> Var<T> {
-    /// Convolves each channel of [batch, height, width, channels] with its own window w [kh, kw, channels], and adds its
-    /// bias \[channels\]. `padding` zeros on each side.
+    /// Convolves each channel of [batch, height, width, channels] with its own window w [kh, kw, channels], and adds
+    /// its bias \[channels\]. `padding` zeros on each side.
     #[track_caller]
     pub fn depthwise_conv2d(&self, weight: &Self, bias: Option<&Self>, stride: usize, padding: usize) -> Self {
         self.depthwise(weight, bias, DepthwiseConv2d { stride, padding, ..DepthwiseConv2d::default() })

@@ -20,7 +20,8 @@ use crate::tensor::gemm::Rows;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 
 /// `x0 [batch, height, width, ..], x1 .. xn [batch, 2 height, 2 width, ..], w [k, k, in, out]`, optionally `b [out]`
-/// -> `[batch, 2 height, 2 width, out]`: the convolution of x0, enlarged, and x1 .. xn, concatenated along the channels.
+/// -> `[batch, 2 height, 2 width, out]`: the convolution of x0, enlarged, and x1 .. xn, concatenated along the
+/// channels.
 ///
 /// k is 1, or 3 with mirrored padding of 1, so that the size stays.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

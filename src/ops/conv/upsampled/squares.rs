@@ -107,7 +107,8 @@ pub(super) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, g: &Geometry
 fn turned<T: Float>(g: &Geometry, w: &[T]) -> Buffer<T> {
     let (c, n) = (g.channels, g.out_channels);
     let mut out = Buffer::filled(16 * n * c, T::ZERO);
-    // Row a of the 4x4 window is row 2y + a - 1 of the output, which sees row y with rows 2 - a and 3 - a of its window.
+    // Row a of the 4x4 window is row 2y + a - 1 of the output, which sees row y with rows 2 - a and 3 - a of its
+    // window.
     let seen = |a: usize| (2usize.saturating_sub(a)..=3 - a).filter(move |k| *k < 3 && *k + a >= 2);
     parallel::for_each_chunk(&mut out, n * c, 4 * w.len(), |at, out| {
         for ky in seen(at / 4) {
@@ -122,8 +123,8 @@ fn turned<T: Float>(g: &Geometry, w: &[T]) -> Buffer<T> {
     out
 }
 
-/// dw, in a fixed number of partial sums: first of the 2x2 windows, then each of their weights counts for all those that
-/// were added to make it.
+/// dw, in a fixed number of partial sums: first of the 2x2 windows, then each of their weights counts for all those
+/// that were added to make it.
 pub(super) fn weight_gradient<T: Float>(out: &mut [T], g: &Geometry, x: &[T], dy: &[T]) {
     let (c, n, width, tile) = (g.channels, g.out_channels, g.out[1], tile(g));
     if c * n == 0 {
