@@ -9,6 +9,9 @@ use crate::{Error, Result};
 /// The most bytes that text written by people has: a configuration, a camera, a calibration.
 pub const MAX_SETTINGS: u64 = 1 << 20;
 
+/// Pictures with more pixels are refused.
+pub const MAX_PIXELS: u64 = 100_000_000;
+
 /// The bytes of a file, which is refused if it has more than `limit`; `what` it is meant to be stands in the message. What
 /// is no real file and never ends (a device, a pipe) is refused as well, after as much.
 ///

@@ -11,11 +11,9 @@ use std::sync::Once;
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageError, ImageReader, Limits, RgbImage};
 
+pub use super::bounded::MAX_PIXELS;
 use super::picture_structure as structure;
 use crate::{Error, Result};
-
-/// Pictures with more pixels are refused.
-pub const MAX_PIXELS: u64 = 100_000_000;
 
 /// Files with more bytes are not read: no picture of [`MAX_PIXELS`] needs so many.
 pub const MAX_BYTES: u64 = 1 << 30;
