@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-use parallax::data::Dataset;
+use parallax::data::DataSource;
 use parallax::data::kitti::{Kitti, Options};
 use parallax::formats::npy::write_npy_shaped;
 use parallax::monovit::{MonoVit, Preset};

@@ -6,7 +6,7 @@ use std::process::{Command, Output};
 use std::sync::Arc;
 
 use parallax::camera::Intrinsics;
-use parallax::data::Dataset;
+use parallax::data::DataSource;
 use parallax::depth::DepthMap;
 use parallax::formats::safetensors;
 use parallax::monovit::Preset;
@@ -17,7 +17,7 @@ use parallax::train::recipe::read_config;
 use parallax::train::rotations::Rotations;
 use parallax::train::run::{Ended, Event, Run, RunData, RunMetrics, load_weights};
 
-fn street(seed: u64) -> Arc<dyn Dataset> {
+fn street(seed: u64) -> Arc<dyn DataSource> {
     let config = StreetConfig { height: 64, width: 96, sequences: 1, frames: 8, seed, ..StreetConfig::default() };
     Arc::new(Street::render(&config, None))
 }
@@ -94,13 +94,13 @@ fn a_resumed_run_ends_like_one_that_never_stopped() {
 
 /// A street of which only some frames have depth, and which may have lost a picture.
 struct Patchy {
-    street: Arc<dyn Dataset>,
+    street: Arc<dyn DataSource>,
     samples: usize,
     has_depth: fn(usize) -> bool,
     lost: Option<usize>,
 }
 
-impl Dataset for Patchy {
+impl DataSource for Patchy {
     fn len(&self) -> usize {
         self.samples
     }
@@ -121,7 +121,7 @@ impl Dataset for Patchy {
     }
 }
 
-fn patchy(samples: usize, has_depth: fn(usize) -> bool) -> Arc<dyn Dataset> {
+fn patchy(samples: usize, has_depth: fn(usize) -> bool) -> Arc<dyn DataSource> {
     Arc::new(Patchy { street: street(2), samples, has_depth, lost: None })
 }
 

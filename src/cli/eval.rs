@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use parallax::Result;
-use parallax::data::Dataset;
+use parallax::data::DataSource;
 use parallax::data::kitti::{Camera, DepthAxis, GroundTruth, Kitti, LeftOut, Options};
 use parallax::eval::metrics::{Protocol, Report, STEREO_SCALE, Scale};
 use parallax::eval::predictions::Predictions;
@@ -190,7 +190,7 @@ fn print(measured: &Measured, scale: Scale) {
 
 impl Args {
     /// What is measured on, and which of its frames cannot be.
-    fn open(&self, height: usize, width: usize) -> Result<(Box<dyn Dataset>, LeftOut)> {
+    fn open(&self, height: usize, width: usize) -> Result<(Box<dyn DataSource>, LeftOut)> {
         if self.data == "street" {
             let street = StreetConfig { height, width, sequences: 8, seed: self.seed, ..StreetConfig::default() };
             return Ok((Box::new(Street::render(&street, None)), LeftOut::default()));

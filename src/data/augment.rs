@@ -32,9 +32,9 @@ pub fn flip(image: &RgbImage) -> RgbImage {
 /// The camera of a mirrored picture of `width` pixels. Pixel centres are whole numbers, so pixel u becomes W - 1 - u, and
 /// the principal point with it: `cx' = 1 - 1/W - cx` over the width. That of 0.5 becomes 0.496875 at 320 pixels.
 ///
-/// Constants that are a convention and no measurement stay as they are: [`Dataset::mirrored_intrinsics`] decides.
+/// Constants that are a convention and no measurement stay as they are: [`DataSource::mirrored_intrinsics`] decides.
 ///
-/// [`Dataset::mirrored_intrinsics`]: super::Dataset::mirrored_intrinsics
+/// [`DataSource::mirrored_intrinsics`]: super::DataSource::mirrored_intrinsics
 pub fn flip_intrinsics(camera: Intrinsics, width: usize) -> Intrinsics {
     let width = width as f64;
     Intrinsics { cx: (width - 1.0) / width - camera.cx, ..camera }

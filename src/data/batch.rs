@@ -11,7 +11,7 @@ use std::thread::JoinHandle;
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
-use super::Dataset;
+use super::DataSource;
 use super::augment::{Jitter, flip};
 use super::resize::lanczos;
 use crate::camera::Intrinsics;
@@ -147,7 +147,7 @@ impl SkipList {
     }
 
     /// The frames of a sample, or of the next one after it that can be read.
-    fn read(&self, data: &dyn Dataset, sample: usize) -> Result<(usize, [Arc<RgbImage>; 3])> {
+    fn read(&self, data: &dyn DataSource, sample: usize) -> Result<(usize, [Arc<RgbImage>; 3])> {
         for sample in (sample..data.len()).chain(0..sample) {
             let name = data.name(sample);
             if self.has(&name) {
@@ -164,7 +164,7 @@ impl SkipList {
 }
 
 /// The previous, the target and the next frame of a sample.
-fn frames(data: &dyn Dataset, sample: usize) -> Result<[Arc<RgbImage>; 3]> {
+fn frames(data: &dyn DataSource, sample: usize) -> Result<[Arc<RgbImage>; 3]> {
     Ok([data.image(sample, -1)?, data.image(sample, 0)?, data.image(sample, 1)?])
 }
 
@@ -172,7 +172,7 @@ fn frames(data: &dyn Dataset, sample: usize) -> Result<[Arc<RgbImage>; 3]> {
 ///
 /// # Errors
 /// If a frame cannot be read.
-pub fn batch_of_step(data: &dyn Dataset, augment: Augment, batch: usize, seed: u64, step: u64) -> Result<Batch> {
+pub fn batch_of_step(data: &dyn DataSource, augment: Augment, batch: usize, seed: u64, step: u64) -> Result<Batch> {
     assemble(data, augment, batch, seed, step, None)
 }
 
@@ -182,7 +182,7 @@ pub fn batch_of_step(data: &dyn Dataset, augment: Augment, batch: usize, seed: u
 /// # Errors
 /// If no sample can be read.
 pub fn batch_of_readable(
-    data: &dyn Dataset,
+    data: &dyn DataSource,
     augment: Augment,
     batch: usize,
     seed: u64,
@@ -193,7 +193,7 @@ pub fn batch_of_readable(
 }
 
 fn assemble(
-    data: &dyn Dataset,
+    data: &dyn DataSource,
     augment: Augment,
     batch: usize,
     seed: u64,
@@ -262,7 +262,7 @@ impl Loader {
     /// # Errors
     /// If there are fewer samples than a batch holds.
     pub fn start(
-        data: Arc<dyn Dataset>,
+        data: Arc<dyn DataSource>,
         augment: Augment,
         batch: usize,
         seed: u64,
@@ -398,7 +398,7 @@ mod tests {
     /// A street of which some samples cannot be read.
     struct Damaged(Street, fn(usize) -> bool);
 
-    impl Dataset for Damaged {
+    impl DataSource for Damaged {
         fn len(&self) -> usize {
             self.0.len()
         }

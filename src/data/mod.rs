@@ -17,7 +17,7 @@ use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
 
 /// Samples for training and evaluation: each a target frame with its neighbours in time.
-pub trait Dataset: Send + Sync {
+pub trait DataSource: Send + Sync {
     /// How many samples there are.
     fn len(&self) -> usize;
 
@@ -57,18 +57,18 @@ pub trait Dataset: Send + Sync {
 
 /// Some samples of a data set.
 pub struct Subset {
-    data: Arc<dyn Dataset>,
+    data: Arc<dyn DataSource>,
     samples: Vec<usize>,
 }
 
 impl Subset {
     /// Those with the given indices.
-    pub fn new(data: Arc<dyn Dataset>, samples: Vec<usize>) -> Self {
+    pub fn new(data: Arc<dyn DataSource>, samples: Vec<usize>) -> Self {
         Subset { data, samples }
     }
 }
 
-impl Dataset for Subset {
+impl DataSource for Subset {
     fn len(&self) -> usize {
         self.samples.len()
     }

@@ -4,13 +4,13 @@ use std::sync::Arc;
 
 use image::RgbImage;
 
-use super::Dataset;
+use super::DataSource;
 use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
 use crate::street::Street;
 use crate::{Error, Result};
 
-impl Dataset for Street {
+impl DataSource for Street {
     fn len(&self) -> usize {
         self.samples()
     }

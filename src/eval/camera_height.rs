@@ -68,7 +68,7 @@ pub fn find_ground(inverse_depth: &[f32], (height, width): (usize, usize), camer
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::data::Dataset;
+    use crate::data::DataSource;
     use crate::street::{Street, StreetConfig};
 
     /// The street's camera hangs so high, in metres.

@@ -9,7 +9,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use crate::data::Dataset;
+use crate::data::DataSource;
 use crate::depth::{DepthMap, resize_bilinear};
 use crate::{Error, Result};
 
@@ -420,7 +420,7 @@ impl MeanMap {
     }
 
     /// [`MeanMap::of`] the target frames of a data set (the one that a network is trained on).
-    pub fn of_dataset(data: &dyn Dataset) -> Result<MeanMap> {
+    pub fn of_dataset(data: &dyn DataSource) -> Result<MeanMap> {
         MeanMap::of((0..data.len()).filter_map(|sample| data.depth(sample).transpose()))
     }
 }

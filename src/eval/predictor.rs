@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::metrics::{MeanMap, Protocol, Report, Scale, evaluate_image, flip_post_process, mirror};
 use super::predictions::Predictions;
-use crate::data::Dataset;
+use crate::data::DataSource;
 use crate::data::augment::flip;
 use crate::data::batch::to_tensor;
 use crate::data::resize::lanczos;
@@ -125,7 +125,7 @@ impl Predictor {
 /// If no sample has ground truth, or one cannot be read.
 pub fn evaluate(
     predictor: &Predictor,
-    data: &dyn Dataset,
+    data: &dyn DataSource,
     samples: &[usize],
     how: Evaluation,
     seen: impl FnMut(usize),
@@ -144,7 +144,7 @@ pub fn evaluate(
 /// As [`evaluate`], and if there is not one map for each sample.
 pub fn evaluate_predictions(
     predictions: &Predictions,
-    data: &dyn Dataset,
+    data: &dyn DataSource,
     how: Evaluation,
     seen: impl FnMut(usize),
 ) -> Result<Report> {
@@ -160,13 +160,13 @@ pub fn evaluate_predictions(
 ///
 /// # Errors
 /// As [`evaluate`].
-pub fn evaluate_mean_map(map: &MeanMap, data: &dyn Dataset, samples: &[usize], how: Evaluation) -> Result<Report> {
+pub fn evaluate_mean_map(map: &MeanMap, data: &dyn DataSource, samples: &[usize], how: Evaluation) -> Result<Report> {
     compare(data, samples, how, |_| (), |_| Ok((map.inverse_depth.clone(), map.size)))
 }
 
 /// Compares predictions (inverse depth and its rows and columns) with the ground truth of those samples that have one.
 fn compare(
-    data: &dyn Dataset,
+    data: &dyn DataSource,
     samples: &[usize],
     how: Evaluation,
     mut seen: impl FnMut(usize),

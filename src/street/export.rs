@@ -95,7 +95,7 @@ fn calibration(config: &StreetConfig) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::data::Dataset;
+    use crate::data::DataSource;
 
     #[test]
     fn files_say_what_was_rendered_and_nothing_is_overwritten() {

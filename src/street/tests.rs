@@ -1,7 +1,7 @@
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use super::*;
-use crate::data::Dataset;
+use crate::data::DataSource;
 
 fn small() -> StreetConfig {
     StreetConfig { height: 48, width: 160, sequences: 3, frames: 5, ..StreetConfig::default() }

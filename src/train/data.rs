@@ -7,7 +7,7 @@ use std::sync::Arc;
 use super::recipe::RunConfig;
 use super::run::RunData;
 use crate::data::kitti::{Kitti, Options};
-use crate::data::{Dataset, Subset};
+use crate::data::{DataSource, Subset};
 use crate::error::{Error, Result};
 use crate::street::{Street, StreetConfig};
 
@@ -55,10 +55,10 @@ fn folder(config: &RunConfig) -> Result<RunData> {
     let root = Path::new(&config.data);
     let options = Options { camera: config.camera, skip_bad_frames: config.skip_bad_frames, ..Options::default() };
     let open = |split: Option<&Path>| Kitti::open(root, split, config.height, config.width, options);
-    let all: Arc<dyn Dataset> = Arc::new(open(config.split.as_deref())?);
-    let (train, aside): (Arc<dyn Dataset>, Arc<dyn Dataset>) = match &config.val_split {
+    let all: Arc<dyn DataSource> = Arc::new(open(config.split.as_deref())?);
+    let (train, aside): (Arc<dyn DataSource>, Arc<dyn DataSource>) = match &config.val_split {
         Some(split) => {
-            let aside: Arc<dyn Dataset> = Arc::new(open(Some(split))?);
+            let aside: Arc<dyn DataSource> = Arc::new(open(Some(split))?);
             apart(all.as_ref(), aside.as_ref(), split)?;
             (all, aside)
         }
@@ -75,12 +75,12 @@ fn folder(config: &RunConfig) -> Result<RunData> {
     Ok(RunData {
         train,
         validation: Arc::new(Subset::new(aside.clone(), validation)),
-        test: (!test.is_empty()).then(|| Arc::new(Subset::new(aside, test)) as Arc<dyn Dataset>),
+        test: (!test.is_empty()).then(|| Arc::new(Subset::new(aside, test)) as Arc<dyn DataSource>),
     })
 }
 
 /// Makes sure that no frame is trained on and validated on.
-fn apart(train: &dyn Dataset, aside: &dyn Dataset, split: &Path) -> Result<()> {
+fn apart(train: &dyn DataSource, aside: &dyn DataSource, split: &Path) -> Result<()> {
     let trained: HashSet<String> = (0..train.len()).map(|i| train.name(i)).collect();
     match (0..aside.len()).map(|i| aside.name(i)).find(|name| trained.contains(name)) {
         Some(name) => Err(Error::file(split, format!("{name} is trained on, too: take it out of one of the lists"))),

@@ -19,7 +19,7 @@ use super::start::Start;
 use super::state::{self, Notes};
 use super::trainer::{StepReport, Trainer};
 pub use super::validation::{RunMetrics, Validation};
-use crate::data::Dataset;
+use crate::data::DataSource;
 use crate::data::batch::{Loader, SkipList};
 use crate::error::{Error, Result};
 use crate::formats::atomic::{self, check_writable, write_bytes_atomically};
@@ -31,11 +31,11 @@ use crate::weights::{self, Need, Weights};
 /// The samples that a run trains on, validates on and reports on. None is in two of them.
 pub struct RunData {
     /// Trained on.
-    pub train: Arc<dyn Dataset>,
+    pub train: Arc<dyn DataSource>,
     /// The photometric loss on these selects the best weights.
-    pub validation: Arc<dyn Dataset>,
+    pub validation: Arc<dyn DataSource>,
     /// `metrics.json` reports on these, where there is ground truth.
-    pub test: Option<Arc<dyn Dataset>>,
+    pub test: Option<Arc<dyn DataSource>>,
 }
 
 /// A logged step.

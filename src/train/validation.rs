@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::log::Log;
 use super::run::{BEST, Event, Run, RunData, load_weights, write_weights};
-use crate::data::Dataset;
+use crate::data::DataSource;
 use crate::data::batch::{Augment, Batch, batch_of_readable, batch_of_step};
 use crate::error::{Error, Result};
 use crate::eval::metrics::{MeanMap, Metrics, Protocol, Report, Scale};
@@ -174,7 +174,7 @@ impl Run {
 }
 
 /// Depth on at most forty validation samples, evenly over all, as far as there is ground truth.
-fn validation_depth(predictor: &Predictor, data: &dyn Dataset, tell: &mut impl FnMut(Event)) -> Option<Report> {
+fn validation_depth(predictor: &Predictor, data: &dyn DataSource, tell: &mut impl FnMut(Event)) -> Option<Report> {
     let samples: Vec<usize> = (0..data.len()).step_by(data.len().div_ceil(40).max(1)).collect();
     let has_depth = |&sample: &usize| !matches!(data.depth(sample), Ok(None));
     let samples: Vec<usize> = samples.into_iter().filter(has_depth).collect();
@@ -190,7 +190,7 @@ fn told<T>(what: &str, found: Result<T>, tell: &mut impl FnMut(Event)) -> Option
 }
 
 /// A few pictures with their predicted disparity (and the true one, where it is known) below.
-fn write_images(folder: &Path, predictor: &Predictor, data: &dyn Dataset) -> Result<()> {
+fn write_images(folder: &Path, predictor: &Predictor, data: &dyn DataSource) -> Result<()> {
     let count = data.len().min(8);
     for i in 0..count {
         let sample = i * data.len() / count;

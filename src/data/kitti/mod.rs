@@ -27,7 +27,7 @@ pub use camera::Camera;
 pub use lidar::{DepthAxis, project_scan, read_scan};
 pub use split::{Side, SplitLine, read_split};
 
-use super::Dataset;
+use super::DataSource;
 use super::augment::flip_intrinsics;
 use super::resize::lanczos;
 use crate::camera::Intrinsics;
@@ -157,7 +157,7 @@ struct Cache {
     bytes: usize,
 }
 
-/// KITTI raw as a [`Dataset`].
+/// KITTI raw as a [`DataSource`].
 pub struct Kitti {
     drives: Vec<Drive>,
     samples: Vec<Frame>,
@@ -515,7 +515,7 @@ impl Kitti {
     }
 }
 
-impl Dataset for Kitti {
+impl DataSource for Kitti {
     fn len(&self) -> usize {
         self.samples.len()
     }
