@@ -2,9 +2,8 @@
 
 use parallax::Result;
 use parallax::monovit::MonoVit;
-use parallax::nn::Context;
-use parallax::tensor::profile;
-use parallax::tensor::{Tensor, Var};
+use parallax::tensor::parallel;
+use parallax::train::cost::Cost;
 use serde::Serialize;
 
 use super::ablation::Networks;
@@ -32,21 +31,18 @@ struct Info {
     gflop_inference: f64,
     gflop_step: f64,
     memory_bytes: u64,
+    /// On this machine, from a short measurement.
+    seconds_inference: f64,
+    seconds_step: f64,
 }
 
 pub fn run(args: Args) -> Result<()> {
     let Args { sizes: args, networks } = args;
     args.check()?;
-    let (model, params) = MonoVit::new::<f32>(networks.config(args.preset)?, 0);
-    // Counted by running one picture: the arithmetic of an op is said by the op itself.
-    let c = Context::inference(&params);
-    let image = Var::constant(Tensor::zeros([1, args.height, args.width, 3]));
-    let (_, depth) = profile::record(false, || model.disparities(&c, &image));
-    let (_, pose) = profile::record(false, || model.transforms(&c, &image, &image, &image));
-    let count = |entries: &[profile::Entry]| entries.iter().map(|e| e.flops).sum::<u64>() as f64 * 1e-9;
-    let outputs: usize = depth.iter().chain(&pose).map(|e| e.output.len()).sum();
+    let config = networks.config(args.preset)?;
+    let cost = Cost::of(&config, [args.height, args.width], args.batch)?;
+    let (_, params) = MonoVit::new::<f32>(config, 0);
     let part = |prefix: &str| params.count(prefix);
-    let batch = args.batch as f64;
     let parameters = Parameters {
         encoder: part("encoder."),
         depth: part("depth."),
@@ -55,10 +51,11 @@ pub fn run(args: Args) -> Result<()> {
     };
     let learnt: usize = params.count("");
     let info = Info {
-        gflop_inference: batch * count(&depth),
-        gflop_step: batch * 3.0 * (count(&depth) + count(&pose)),
-        // Weights, two moments, gradients, the average; and every op's output, kept for the backward pass.
-        memory_bytes: 4 * (5 * learnt + args.batch * outputs) as u64,
+        gflop_inference: 1e-9 * cost.flops_inference,
+        gflop_step: 1e-9 * cost.flops_step,
+        memory_bytes: cost.bytes_step as u64,
+        seconds_inference: cost.seconds_inference,
+        seconds_step: cost.seconds_step,
         parameters,
     };
     if args.json {
@@ -69,9 +66,23 @@ pub fn run(args: Args) -> Result<()> {
     for (name, n) in [("encoder", p.encoder), ("depth", p.depth), ("pose encoder", p.pose_encoder), ("pose", p.pose)] {
         say!("{name:14} {n:>12} parameters");
     }
+    let threads = parallel::threads();
     say!("{:14} {learnt:>12} parameters", "together");
-    say!("{:14} {:>12.2} GFLOP", "inference", info.gflop_inference);
-    say!("{:14} {:>12.2} GFLOP", "training step", info.gflop_step);
+    for (name, gflop, seconds) in [
+        ("inference", info.gflop_inference, info.seconds_inference),
+        ("training step", info.gflop_step, info.seconds_step),
+    ] {
+        say!("{name:14} {gflop:>12.2} GFLOP, about {} on {threads} threads of this machine", time(seconds));
+    }
     say!("{:14} {:>12.0} MiB (estimate)", "training step", info.memory_bytes as f64 / f64::from(1 << 20));
     Ok(())
+}
+
+/// A stretch of time in a unit that fits it.
+fn time(seconds: f64) -> String {
+    match seconds {
+        s if s < 1.0 => format!("{:.0} ms", 1e3 * s),
+        s if s < 600.0 => format!("{s:.1} s"),
+        s => format!("{:.0} min", s / 60.0),
+    }
 }

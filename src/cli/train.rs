@@ -7,6 +7,7 @@ use std::time::Instant;
 
 use parallax::data::kitti::Camera;
 use parallax::monovit::{Preset, Setup};
+use parallax::train::cost::check_memory;
 use parallax::train::data::{self, STREET};
 use parallax::train::recipe::{RunConfig, STEPS, read_config};
 use parallax::train::run::{Ended, Event, Run, RunData, RunMetrics};
@@ -224,6 +225,7 @@ fn show(event: &Event, progress: &mut Progress, stop: &Stop) {
 fn create(args: &Args) -> Result<(Run, RunData)> {
     let mut config = configuration(args)?;
     config.check()?;
+    check_memory(&config)?;
     // Weights that do not fit are found out before anything is rendered or made.
     let start = Start::of(&config)?;
     for (files, report) in &start.reports {

@@ -24,6 +24,14 @@ static POISON: AtomicBool = AtomicBool::new(false);
 static HELD: AtomicUsize = AtomicUsize::new(0);
 static CAP: AtomicUsize = AtomicUsize::new(8 << 30);
 static FRESH: AtomicU64 = AtomicU64::new(0);
+static USED: AtomicUsize = AtomicUsize::new(0);
+static PEAK: AtomicUsize = AtomicUsize::new(0);
+
+/// Counts a buffer that somebody holds from now on.
+fn count(bytes: usize) {
+    let used = USED.fetch_add(bytes, Relaxed) + bytes;
+    PEAK.fetch_max(used, Relaxed);
+}
 
 /// The class that holds `len` elements, and the length of its buffers.
 fn class_of(len: usize) -> (usize, usize) {
@@ -75,6 +83,7 @@ impl<T: Float> Buffer<T> {
     /// `len` elements of *unspecified* value: whoever asks writes every one of them before reading it.
     pub fn stale(len: usize) -> Self {
         let mut store = T::pool().take(len);
+        count(len * size_of::<T>());
         if POISON.load(Relaxed) {
             store[..len].fill(T::NAN);
         }
@@ -92,6 +101,7 @@ impl<T: Float> Buffer<T> {
 impl<T: Float> From<Vec<T>> for Buffer<T> {
     fn from(store: Vec<T>) -> Self {
         let len = store.len();
+        count(len * size_of::<T>());
         Buffer { store, len }
     }
 }
@@ -121,6 +131,7 @@ impl<T: Float> Clone for Buffer<T> {
 
 impl<T: Float> Drop for Buffer<T> {
     fn drop(&mut self) {
+        USED.fetch_sub(self.len * size_of::<T>(), Relaxed);
         T::pool().give(std::mem::take(&mut self.store));
     }
 }
@@ -128,6 +139,19 @@ impl<T: Float> Drop for Buffer<T> {
 /// Whether buffers are filled with NaN before they are handed out, to expose reads of stale values.
 pub fn set_poison(on: bool) {
     POISON.store(on, Relaxed);
+}
+
+/// The bytes of all buffers that somebody holds now.
+pub fn used_bytes() -> usize {
+    USED.load(Relaxed)
+}
+
+/// The most bytes that were held at once while `f` ran, by anybody in this process, beyond what was held before.
+pub fn peak_of<R>(f: impl FnOnce() -> R) -> (R, usize) {
+    let before = used_bytes();
+    PEAK.store(before, Relaxed);
+    let result = f();
+    (result, PEAK.load(Relaxed).saturating_sub(before))
 }
 
 /// The bytes that wait in free lists.

@@ -1,5 +1,6 @@
 //! Training: the recipe, what it starts from, the step, and the run that keeps it all in a folder.
 
+pub mod cost;
 pub mod data;
 mod log;
 pub mod recipe;
@@ -33,6 +34,7 @@ use run::{Ended, Event, Run, RunMetrics};
 /// If the configuration, the folder or the data cannot be used, or a step fails.
 pub fn train(config: RunConfig, folder: &Path, tell: impl FnMut(Event)) -> Result<RunMetrics> {
     config.check()?;
+    cost::check_memory(&config)?;
     Run::claim(folder)?;
     let data = data::open(&config, &|_, _, _| ())?;
     match Run::create(folder, config)?.train(&data, || false, tell)? {
