@@ -1,7 +1,7 @@
 //! AdamW (Loshchilov and Hutter, 1711.05101): Adam with decoupled weight decay.
 
 use crate::nn::Params;
-use crate::tensor::{Float, Tensor, parallel, simd};
+use crate::tensor::{Float, Tensor, parallel, regime, simd};
 
 /// The settings of a group of parameters.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -56,8 +56,9 @@ impl<T: Float> AdamW<T> {
             let Group { learning_rate: lr, decay } = groups[i];
             let (keep, rate) = (T::of(1.0 - lr * decay), T::of(lr / correct(b1)));
             let (b1, b2, c1, c2) = (T::of(b1), T::of(b2), T::of(1.0 - b1), T::of(1.0 - b2));
-            let pieces = weights.data_mut().chunks_mut(CHUNK).zip(g.data().chunks(CHUNK));
-            let pieces = pieces.zip(m.data_mut().chunks_mut(CHUNK).zip(v.data_mut().chunks_mut(CHUNK)));
+            let chunk = regime::size(CHUNK);
+            let pieces = weights.data_mut().chunks_mut(chunk).zip(g.data().chunks(chunk));
+            let pieces = pieces.zip(m.data_mut().chunks_mut(chunk).zip(v.data_mut().chunks_mut(chunk)));
             parallel::for_each_piece(pieces, 8 * g.len(), |((w, g), (m, v))| {
                 simd::dispatch(
                     #[inline(always)]

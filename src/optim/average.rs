@@ -1,7 +1,7 @@
 //! An exponential moving average of the weights: smoother than the last step, and often better.
 
 use crate::nn::Params;
-use crate::tensor::{Float, Tensor, parallel, simd};
+use crate::tensor::{Float, Tensor, parallel, regime, simd};
 
 /// Elements handed to a thread at a time.
 const CHUNK: usize = 1 << 14;
@@ -28,8 +28,9 @@ impl<T: Float> Average<T> {
         let take = T::of(1.0 - decay);
         for (average, (_, p)) in self.values.iter_mut().zip(params.iter()) {
             let weights = p.value.data();
-            parallel::for_each_chunk(average.data_mut(), CHUNK, 2 * weights.len(), |i, average| {
-                let weights = &weights[i * CHUNK..][..average.len()];
+            let chunk = regime::size(CHUNK);
+            parallel::for_each_chunk(average.data_mut(), chunk, 2 * weights.len(), |i, average| {
+                let weights = &weights[i * chunk..][..average.len()];
                 simd::dispatch(
                     #[inline(always)]
                     || average.iter_mut().zip(weights).for_each(|(a, &w)| *a += take * (w - *a)),

@@ -1,6 +1,6 @@
 //! The norm of all gradients together, and a bound on it.
 
-use crate::tensor::{Float, Tensor, parallel, simd};
+use crate::tensor::{Float, Tensor, parallel, regime, simd};
 
 /// Elements handed to a thread at a time.
 const CHUNK: usize = 1 << 14;
@@ -25,8 +25,9 @@ fn sum_of_squares<T: Float>(x: &[T]) -> f64 {
 /// The Euclidean norm of all gradients as one vector.
 pub fn norm<T: Float>(gradients: &[Option<Tensor<T>>]) -> f64 {
     let squares = |g: &Tensor<T>| {
-        let chunk = |i: usize| sum_of_squares(&g.data()[i * CHUNK..((i + 1) * CHUNK).min(g.len())]);
-        parallel::map(g.len().div_ceil(CHUNK), 2 * g.len(), chunk).into_iter().sum::<f64>()
+        let chunk = regime::size(CHUNK);
+        let sum = |i: usize| sum_of_squares(&g.data()[i * chunk..((i + 1) * chunk).min(g.len())]);
+        parallel::map(g.len().div_ceil(chunk), 2 * g.len(), sum).into_iter().sum::<f64>()
     };
     gradients.iter().flatten().map(squares).sum::<f64>().sqrt()
 }
@@ -39,7 +40,7 @@ pub fn clip_norm<T: Float>(gradients: &mut [Option<Tensor<T>>], bound: f64) -> f
         for g in gradients.iter_mut().flatten() {
             let g = g.data_mut();
             let work = g.len();
-            parallel::for_each_chunk(g, CHUNK, work, |_, g| g.iter_mut().for_each(|x| *x *= factor));
+            parallel::for_each_chunk(g, regime::size(CHUNK), work, |_, g| g.iter_mut().for_each(|x| *x *= factor));
         }
     }
     before

@@ -25,6 +25,7 @@ pub mod gradients;
 pub mod parallel;
 pub mod pool;
 pub mod profile;
+pub mod regime;
 pub(crate) mod register_tile;
 pub mod shape;
 pub mod simd;

@@ -2,7 +2,10 @@
 //! do not depend on how many threads there were.
 
 use std::cell::RefCell;
+use std::panic::Location;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use super::regime;
 
 /// Where the chunks of a kernel run.
 #[derive(Clone, Default)]
@@ -58,9 +61,9 @@ pub fn threads() -> usize {
     }
 }
 
-/// Whether work of this size stays on the calling thread.
+/// Whether work of this size stays on the calling thread. A shrunk size makes all work worth while.
 fn stays(pieces: usize, work: usize) -> bool {
-    pieces < 2 || work < WORTHWHILE || threads() == 1
+    pieces < 2 || work < regime::size(WORTHWHILE) || threads() == 1
 }
 
 /// Runs `f` inside the pool that kernels use.
@@ -83,7 +86,17 @@ fn split<T: Send>(data: &mut [T], chunk: usize, first: usize, f: &(dyn Fn(usize,
 
 /// The one place where work is handed over. The kernel comes as a `dyn Fn`: it is compiled once, not once for each way
 /// of running it, and the machinery once for each element type.
-fn run<T: Send>(data: &mut [T], chunk: usize, work: usize, f: &(dyn Fn(usize, &mut [T]) + Sync)) {
+///
+/// It notes how often and where work was cut, for the checks that ask ([`regime`]).
+fn run<T: Send>(
+    data: &mut [T],
+    chunk: usize,
+    work: usize,
+    place: &'static Location<'static>,
+    f: &(dyn Fn(usize, &mut [T]) + Sync),
+) {
+    let rest = (size_of::<T>() > 0).then(|| !data.len().is_multiple_of(chunk));
+    regime::note(place, data.len().div_ceil(chunk), rest);
     if stays(data.len().div_ceil(chunk), work) {
         data.chunks_mut(chunk).enumerate().for_each(|(i, c)| f(i, c));
     } else {
@@ -93,32 +106,37 @@ fn run<T: Send>(data: &mut [T], chunk: usize, work: usize, f: &(dyn Fn(usize, &m
 
 /// Calls `f(i)` for every i below `count`, on all threads. `work` is a rough count of elementary operations: below
 /// [`WORTHWHILE`] everything stays on the calling thread.
+#[track_caller]
 pub fn for_each(count: usize, work: usize, f: impl Fn(usize) + Sync + Send) {
-    indices(count, work, &f);
+    indices(count, work, Location::caller(), &f);
 }
 
 /// Nothing to be cut but the indices: the threads' machinery is compiled once for all that runs by index.
-fn indices(count: usize, work: usize, f: &(dyn Fn(usize) + Sync)) {
-    run(&mut vec![(); count], 1, work, &|i, _| f(i));
+fn indices(count: usize, work: usize, place: &'static Location<'static>, f: &(dyn Fn(usize) + Sync)) {
+    run(&mut vec![(); count], 1, work, place, &|i, _| f(i));
 }
 
 /// Collects `f(i)` for every i below `count`, in order.
+#[track_caller]
 pub fn map<R: Send>(count: usize, work: usize, f: impl Fn(usize) -> R + Sync + Send) -> Vec<R> {
     let results: Vec<Mutex<Option<R>>> = (0..count).map(|_| Mutex::new(None)).collect();
-    indices(count, work, &|i| *lock(&results[i]) = Some(f(i)));
+    indices(count, work, Location::caller(), &|i| *lock(&results[i]) = Some(f(i)));
     results.into_iter().filter_map(|r| r.into_inner().unwrap_or_else(PoisonError::into_inner)).collect()
 }
 
 /// Cuts `data` into chunks of `chunk` elements (the last may be shorter) and calls `f(index, chunk)` for each.
+#[track_caller]
 pub fn for_each_chunk<T: Send>(data: &mut [T], chunk: usize, work: usize, f: impl Fn(usize, &mut [T]) + Sync + Send) {
-    run(data, chunk.max(1), work, &f);
+    run(data, chunk.max(1), work, Location::caller(), &f);
 }
 
 /// Calls `f` for every piece: for kernels that write several slices, cut and zipped by the caller.
+#[track_caller]
 pub fn for_each_piece<P: Send>(pieces: impl IntoIterator<Item = P>, work: usize, f: impl Fn(P) + Sync + Send) {
+    let place = Location::caller();
     // Each is taken once, so no thread waits for a lock.
     let pieces: Vec<Mutex<Option<P>>> = pieces.into_iter().map(|p| Mutex::new(Some(p))).collect();
-    indices(pieces.len(), work, &|i| {
+    indices(pieces.len(), work, place, &|i| {
         let piece = lock(&pieces[i]).take();
         piece.into_iter().for_each(&f);
     });

@@ -7,7 +7,7 @@
 use crate::ops::Tile;
 use crate::ops::support::put::{begin_sum, put, put_rounded};
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, pool::Buffer, simd};
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, pool::Buffer, regime, simd};
 
 /// Guards the division by the projected depth, as published.
 const EPSILON: f64 = 1e-7;
@@ -204,8 +204,9 @@ fn warp_row<T: Float>(
     out: &mut [T],
 ) {
     let mut places = Places::new();
-    for (k, (out, depth)) in out.chunks_mut(BLOCK * channels).zip(depth.chunks(BLOCK)).enumerate() {
-        p.project(depth, k * BLOCK, v, e.size(), channels, &mut places);
+    for block in regime::blocks(0..depth.len(), BLOCK) {
+        let (u0, out, depth) = (block.start, &mut out[block.start * channels..block.end * channels], &depth[block]);
+        p.project(depth, u0, v, e.size(), channels, &mut places);
         let [fx, fy] = &places.fraction;
         for (((out, &first), &fx), &fy) in out.chunks_exact_mut(channels).zip(&places.first).zip(fx).zip(fy) {
             let [a, b, c, d] = quad(image, first, e.width * channels, channels);
@@ -235,9 +236,9 @@ fn gradient_row<T: Float>(
     let mut by_place = [[T::ZERO; BLOCK]; 2];
     let vt = T::of(v as f64);
     let base: [T; 3] = std::array::from_fn(|k| p.matrix[k][1].mul_add(vt, p.matrix[k][2]));
-    let blocks = by_depth.chunks_mut(BLOCK).zip(depth.chunks(BLOCK)).zip(g.chunks(BLOCK * channels));
-    for (k, ((by_depth, depth), g)) in blocks.enumerate() {
-        let u0 = k * BLOCK;
+    for block in regime::blocks(0..depth.len(), BLOCK) {
+        let (u0, g) = (block.start, &g[block.start * channels..block.end * channels]);
+        let (by_depth, depth) = (&mut by_depth[block.clone()], &depth[block]);
         p.project(depth, u0, v, e.size(), channels, &mut places);
         let [fx, fy] = &places.fraction;
         let [gx, gy] = &mut by_place;
@@ -252,7 +253,7 @@ fn gradient_row<T: Float>(
             }
             (*gx, *gy) = (x, y);
         }
-        let n = depth.len().min(BLOCK).min(by_depth.len());
+        let n = depth.len().min(by_depth.len());
         let mut parts = sums.chunks_exact_mut(e.width);
         let sums: [&mut [T]; SUMS] = std::array::from_fn(|_| &mut parts.next().expect("nine rows")[u0..][..n]);
         let [d0, v0, g0, d1, v1, g1, d2, v2, g2] = sums;
@@ -378,8 +379,10 @@ impl Warp {
                 let at = b * e.height + v;
                 let depth = &depth.data()[at * e.width..][..e.width];
                 let g = &g.data()[at * e.row()..][..e.row()];
-                for (k, (depth, g)) in depth.chunks(BLOCK).zip(g.chunks(BLOCK * e.channels)).enumerate() {
-                    p.project(depth, k * BLOCK, v, e.size(), e.channels, &mut places);
+                for block in regime::blocks(0..depth.len(), BLOCK) {
+                    let g = &g[block.start * e.channels..block.end * e.channels];
+                    let (u0, depth) = (block.start, &depth[block]);
+                    p.project(depth, u0, v, e.size(), e.channels, &mut places);
                     let [fx, fy] = &places.fraction;
                     for (((g, &first), &fx), &fy) in g.chunks_exact(e.channels).zip(&places.first).zip(fx).zip(fy) {
                         for (row, weight) in [(first, T::ONE - fy), (first + e.row(), fy)] {

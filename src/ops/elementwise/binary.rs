@@ -4,7 +4,7 @@
 use crate::ops::support::put::{begin_sum, put};
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply1};
 use crate::tensor::shape::MAX_RANK;
-use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime, simd};
 
 /// A function of two numbers.
 pub trait Function: Copy + Send + Sync + Default + 'static {
@@ -188,9 +188,9 @@ where
         let shape = a.shape().broadcast(b.shape()).expect("checked by the shape rule");
         let y = Tensor::build(shape, |out| {
             if Self::same([a.shape(), b.shape()]) {
-                let work = out.len();
-                parallel::for_each_chunk(out, CHUNK, work, |i, out| {
-                    let (a, b) = (&a.data()[i * CHUNK..][..out.len()], &b.data()[i * CHUNK..][..out.len()]);
+                let (chunk, work) = (regime::size(CHUNK), out.len());
+                parallel::for_each_chunk(out, chunk, work, |i, out| {
+                    let (a, b) = (&a.data()[i * chunk..][..out.len()], &b.data()[i * chunk..][..out.len()]);
                     simd::dispatch(
                         #[inline(always)]
                         || out.iter_mut().zip(a.iter().zip(b)).for_each(|(y, (&a, &b))| *y = F::f(a, b)),
@@ -236,9 +236,9 @@ where
             }
             sink.accumulate(side, |out, accum| {
                 if Self::same([&shapes[0], &shapes[1]]) {
-                    let work = out.len();
-                    parallel::for_each_chunk(out, CHUNK, work, |i, out| {
-                        let first = i * CHUNK;
+                    let (chunk, work) = (regime::size(CHUNK), out.len());
+                    parallel::for_each_chunk(out, chunk, work, |i, out| {
+                        let first = i * chunk;
                         let g = &g.data()[first..first + out.len()];
                         let (a, b) =
                             operands.map_or((g, g), |(a, b)| (&a[first..first + g.len()], &b[first..first + g.len()]));

@@ -3,7 +3,7 @@
 use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::random::Random;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime, simd};
 
 /// `y = x mask / keep`: elements whose mask is 0 are dropped, the others scaled so that the mean stays.
 ///
@@ -25,10 +25,10 @@ const CHUNK: usize = 1 << 14;
 
 /// `out = x mask / keep`, or added to what is there: the value, and the gradient too.
 fn masked<T: Float>(out: &mut [T], accum: Accum, x: &[T], mask: &[T], keep: f64) {
-    let (scale, work) = (T::of(1.0 / keep), 2 * out.len());
+    let (scale, chunk, work) = (T::of(1.0 / keep), regime::size(CHUNK), 2 * out.len());
     let f = |x: T, m: T| if m == T::ZERO { T::ZERO } else { x * m * scale };
-    parallel::for_each_chunk(out, CHUNK, work, |i, out| {
-        let (x, mask) = (&x[i * CHUNK..][..out.len()], &mask[i * CHUNK..][..out.len()]);
+    parallel::for_each_chunk(out, chunk, work, |i, out| {
+        let (x, mask) = (&x[i * chunk..][..out.len()], &mask[i * chunk..][..out.len()]);
         let terms = out.iter_mut().zip(x.iter().zip(mask));
         simd::dispatch(
             #[inline(always)]

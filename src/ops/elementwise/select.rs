@@ -2,7 +2,7 @@
 
 use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
-use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime, simd};
 
 /// `yes` where the condition is not 0 (NaN is not), else `no`; all three of one shape. The condition is not
 /// differentiated.
@@ -30,9 +30,9 @@ impl<T: Float> Op<T> for Select {
     fn forward(&self, inputs: &[&Tensor<T>], needs: &Needs) -> (Vec<Tensor<T>>, Self::Saved) {
         let [condition, yes, no] = [inputs[0], inputs[1], inputs[2]];
         let y = Tensor::build(*condition.shape(), |out| {
-            let work = out.len();
-            parallel::for_each_chunk(out, CHUNK, work, |i, out| {
-                let part = |x: &'_ Tensor<T>| i * CHUNK..(i * CHUNK + CHUNK).min(x.len());
+            let (chunk, work) = (regime::size(CHUNK), out.len());
+            parallel::for_each_chunk(out, chunk, work, |i, out| {
+                let part = |x: &'_ Tensor<T>| i * chunk..(i * chunk + chunk).min(x.len());
                 let (c, a, b) = (&condition.data()[part(condition)], &yes.data()[part(yes)], &no.data()[part(no)]);
                 simd::dispatch(
                     #[inline(always)]
@@ -53,10 +53,10 @@ impl<T: Float> Op<T> for Select {
         let (condition, g) = (saved.expect("saved for a wanted gradient"), upstream.only());
         for (side, taken) in [(1, true), (2, false)] {
             sink.accumulate(side, |out, accum| {
-                let work = out.len();
-                parallel::for_each_chunk(out, CHUNK, work, |i, out| {
-                    let c = &condition.data()[i * CHUNK..][..out.len()];
-                    let g = &g.data()[i * CHUNK..][..out.len()];
+                let (chunk, work) = (regime::size(CHUNK), out.len());
+                parallel::for_each_chunk(out, chunk, work, |i, out| {
+                    let c = &condition.data()[i * chunk..][..out.len()];
+                    let g = &g.data()[i * chunk..][..out.len()];
                     let terms = out.iter_mut().zip(c.iter().zip(g));
                     let share = |c: T, g: T| if (c != T::ZERO) == taken { g } else { T::ZERO };
                     simd::dispatch(

@@ -2,7 +2,7 @@
 
 use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply1};
-use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime, simd};
 
 /// A function of one number.
 pub trait Function: Copy + Send + Sync + 'static {
@@ -41,9 +41,9 @@ where
     fn forward(&self, inputs: &[&Tensor<T>], needs: &Needs) -> (Vec<Tensor<T>>, Self::Saved) {
         let (f, x) = (self.0, inputs[0]);
         let y = Tensor::build(*x.shape(), |out| {
-            let work = 4 * out.len();
-            parallel::for_each_chunk(out, CHUNK, work, |i, out| {
-                let x = &x.data()[i * CHUNK..][..out.len()];
+            let (chunk, work) = (regime::size(CHUNK), 4 * out.len());
+            parallel::for_each_chunk(out, chunk, work, |i, out| {
+                let x = &x.data()[i * chunk..][..out.len()];
                 simd::dispatch(
                     #[inline(always)]
                     || out.iter_mut().zip(x).for_each(|(y, &x)| *y = f.f(x)),
@@ -58,9 +58,9 @@ where
     fn backward(&self, saved: Self::Saved, upstream: Upstream<T>, sink: &mut GradSink<T>) {
         let (f, g, s) = (self.0, upstream.only(), saved.expect("saved for the only input"));
         sink.accumulate(0, |out, accum| {
-            let work = 4 * out.len();
-            parallel::for_each_chunk(out, CHUNK, work, |i, out| {
-                let (g, s) = (&g.data()[i * CHUNK..][..out.len()], &s.data()[i * CHUNK..][..out.len()]);
+            let (chunk, work) = (regime::size(CHUNK), 4 * out.len());
+            parallel::for_each_chunk(out, chunk, work, |i, out| {
+                let (g, s) = (&g.data()[i * chunk..][..out.len()], &s.data()[i * chunk..][..out.len()]);
                 let terms = out.iter_mut().zip(g.iter().zip(s));
                 simd::dispatch(
                     #[inline(always)]

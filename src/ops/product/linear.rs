@@ -10,7 +10,7 @@ use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::gemm::Rows;
 use crate::tensor::pool::Buffer;
 use crate::tensor::register_tile::Panels;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime, simd};
 
 /// Linear layer: `y [.., out] = x [.., in] w [in, out] (+ b [out])`. A 1x1 convolution is the same thing.
 #[derive(Clone, Copy, Debug, Default)]
@@ -32,10 +32,10 @@ fn gelu<T: Float>(to: &mut [T], from: &[T]) {
 
 /// The whole of gelu(x).
 fn apply_gelu<T: Float>(x: &Tensor<T>) -> Tensor<T> {
-    const CHUNK: usize = 1 << 14;
+    let chunk = regime::size(1 << 14);
     Tensor::build(*x.shape(), |out| {
         let work = 16 * out.len();
-        parallel::for_each_chunk(out, CHUNK, work, |i, out| gelu(out, &x.data()[i * CHUNK..][..out.len()]));
+        parallel::for_each_chunk(out, chunk, work, |i, out| gelu(out, &x.data()[i * chunk..][..out.len()]));
     })
 }
 

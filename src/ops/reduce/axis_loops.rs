@@ -8,7 +8,7 @@ use crate::ops::support::axes::cut;
 use crate::ops::support::put::put;
 use crate::ops::support::sums::sum_rows;
 use crate::tensor::pool::Buffer;
-use crate::tensor::{Accum, Float, Shape, parallel, simd};
+use crate::tensor::{Accum, Float, Shape, parallel, regime, simd};
 
 /// A shape cut in three by a run of dimensions.
 #[derive(Clone, Copy, Debug)]
@@ -68,7 +68,7 @@ impl Blocks {
         if piece == 0 {
             return;
         }
-        let group = (CHUNK / self.len().max(1)).max(1);
+        let group = regime::size((CHUNK / self.len().max(1)).max(1));
         let work = 8 * self.outer * self.len();
         parallel::for_each_chunk(out, group * piece, work, |i, out| {
             let mut scratch = Buffer::stale(scratch);

@@ -6,7 +6,7 @@ use crate::ops::support::put::{begin_sum, put};
 use crate::ops::support::sums::sum_rows;
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply, apply1};
 use crate::tensor::pool::Buffer;
-use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime, simd};
 
 /// The sum over a run of dimensions `first..first + count`, times a factor (one over their size makes a mean).
 /// The dimensions are dropped.
@@ -61,7 +61,7 @@ impl<T: Float> Op<T> for Sum {
             if out.is_empty() {
                 return;
             }
-            let (work, tile) = (2 * out.len(), (CHUNK / inner).max(1));
+            let (work, tile) = (2 * out.len(), regime::size((CHUNK / inner).max(1)));
             let pieces = out.chunks_mut(n * inner).zip(g.data().chunks(inner));
             let pieces = pieces.flat_map(|(out, g)| out.chunks_mut(tile * inner).map(move |out| (out, g)));
             parallel::for_each_piece(pieces, work, |(out, g)| {
@@ -89,7 +89,7 @@ const PARTS: usize = 8;
 /// The sum of every `n` rows of `inner` numbers.
 fn sum_each<T: Float>(out: &mut [T], x: &[T], n: usize, inner: usize) {
     let (inner, work) = (inner.max(1), x.len());
-    if n < LONG {
+    if n < regime::size(LONG) {
         return parallel::for_each_chunk(out, inner, work, |i, out| sum_rows(out, &x[i * n * inner..][..n * inner]));
     }
     let step = n.div_ceil(PARTS);

@@ -6,7 +6,7 @@ use crate::ops::Case;
 pub(in crate::ops) use crate::ops::elementwise::unary::{Elu, Hardswish, Relu};
 use crate::ops::elementwise::unary::{Function, Unary};
 use crate::tensor::pool::Buffer;
-use crate::tensor::{Float, Tensor, parallel, simd};
+use crate::tensor::{Float, Tensor, parallel, regime, simd};
 
 /// Makes everything that has a line for each activation: the enum, and the two macros that go through it. A new
 /// activation is a [`Function`] and its line in the list below: its variant, that function, its name, and what it adds
@@ -122,9 +122,9 @@ impl Activation {
     fn of<T: Float>(self, z: &Tensor<T>) -> Tensor<T> {
         let finish = Finish::new(None, self);
         Tensor::build(*z.shape(), |out| {
-            let work = 4 * out.len();
-            parallel::for_each_chunk(out, CHUNK, work, |i, out| {
-                out.copy_from_slice(&z.data()[i * CHUNK..][..out.len()]);
+            let (chunk, work) = (regime::size(CHUNK), 4 * out.len());
+            parallel::for_each_chunk(out, chunk, work, |i, out| {
+                out.copy_from_slice(&z.data()[i * chunk..][..out.len()]);
                 finish.run(out);
             });
         })
@@ -145,9 +145,9 @@ const CHUNK: usize = 1 << 14;
 /// `dy *= f'`.
 fn scale_by_derivative<T: Float>(f: impl Function, kept: &Tensor<T>, dy: &mut Tensor<T>) {
     let dy = dy.data_mut();
-    let work = 4 * dy.len();
-    parallel::for_each_chunk(dy, CHUNK, work, |i, dy| {
-        let kept = &kept.data()[i * CHUNK..][..dy.len()];
+    let (chunk, work) = (regime::size(CHUNK), 4 * dy.len());
+    parallel::for_each_chunk(dy, chunk, work, |i, dy| {
+        let kept = &kept.data()[i * chunk..][..dy.len()];
         simd::dispatch(
             #[inline(always)]
             || dy.iter_mut().zip(kept).for_each(|(d, &k)| *d *= f.df(k)),

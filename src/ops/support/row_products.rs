@@ -7,7 +7,7 @@ use super::sums::sum_into;
 use crate::ops::Tile;
 use crate::tensor::gemm::Rows;
 use crate::tensor::register_tile::{Gram, Line, Panels, Product};
-use crate::tensor::{Accum, Float, Tensor, parallel};
+use crate::tensor::{Accum, Float, Tensor, parallel, regime};
 
 /// Pixels as rows of channels.
 pub(in crate::ops) fn rows_of<T: Float>(x: &Tensor<T>) -> Rows<'_, T> {
@@ -59,7 +59,7 @@ fn line<T: Float>(x: Rows<'_, T>) -> Line<'_, T> {
 
 /// How many partial sums a weight gradient is made of: depends on the shape alone.
 fn partials(rows: usize) -> usize {
-    rows.div_ceil(256).clamp(1, 8)
+    rows.div_ceil(regime::size(256)).clamp(1, 8)
 }
 
 /// Rows of a product that adds to a weight's gradient.
@@ -74,8 +74,8 @@ pub(in crate::ops) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, x: 
         let (from, to) = ((part * step).min(rows), ((part + 1) * step).min(rows));
         begin_sum(out, accum);
         // Sums of sums, as far as rounding goes; and what a product reads stays in the cache.
-        for first in (from..to).step_by(ROWS) {
-            let count = ROWS.min(to - first);
+        for rows in regime::blocks(from..to, ROWS) {
+            let (first, count) = (rows.start, rows.len());
             let (a_step, b_step) = (x.row_stride, g.row_stride);
             let terms = &[(x.rows(first, count).data, g.rows(first, count).data)];
             Gram { out, out_step: n, rows: k, cols: n, terms, count, a_step, b_step }.run();

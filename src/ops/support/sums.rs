@@ -3,12 +3,12 @@
 
 use super::put::put_rounded;
 use crate::tensor::gemm::Rows;
-use crate::tensor::{Accum, Float, GradSink, Tensor, parallel, simd};
+use crate::tensor::{Accum, Float, GradSink, Tensor, parallel, regime, simd};
 
 /// Sums in blocks, and the blocks in pairs: the error grows with the logarithm of the length.
 pub(in crate::ops) fn pairwise_sum<T: Float>(x: &[T]) -> T {
-    const BLOCK: usize = 256;
-    if x.len() <= BLOCK {
+    let block = regime::size(256);
+    if x.len() <= block {
         // Eight sums side by side, which vectorise.
         let mut sums = [T::ZERO; 8];
         let (eights, rest) = x.as_chunks::<8>();
@@ -19,7 +19,7 @@ pub(in crate::ops) fn pairwise_sum<T: Float>(x: &[T]) -> T {
         }
         return sums.into_iter().sum::<T>() + rest.iter().copied().sum::<T>();
     }
-    let (left, right) = x.split_at((x.len() / 2).next_multiple_of(BLOCK));
+    let (left, right) = x.split_at((x.len() / 2).next_multiple_of(block));
     pairwise_sum(left) + pairwise_sum(right)
 }
 
@@ -33,14 +33,14 @@ pub(in crate::ops) fn sum_rows<T: Float>(out: &mut [T], x: &[T]) {
 
 #[inline(always)]
 fn sum_rows_here<T: Float>(out: &mut [T], x: &[T]) {
-    const BLOCK: usize = 64;
+    let block = regime::size(64);
     if let [sum] = out {
         *sum = pairwise_sum(x);
         return;
     }
     let (cols, rows) = (out.len(), x.len() / out.len());
     out.fill(T::ZERO);
-    if rows <= BLOCK {
+    if rows <= block {
         // Four rows at a time: each addition to `out` waits for the one before.
         let mut fours = x.chunks_exact(4 * cols);
         for four in &mut fours {
@@ -55,7 +55,7 @@ fn sum_rows_here<T: Float>(out: &mut [T], x: &[T]) {
         }
         return;
     }
-    let (left, right) = x.split_at((rows / 2).next_multiple_of(BLOCK) * cols);
+    let (left, right) = x.split_at((rows / 2).next_multiple_of(block) * cols);
     sum_rows(out, left);
     let mut other = vec![T::ZERO; cols];
     sum_rows(&mut other, right);
@@ -64,10 +64,10 @@ fn sum_rows_here<T: Float>(out: &mut [T], x: &[T]) {
 
 /// Adds up partial sums in order.
 pub(in crate::ops) fn sum_into<T: Float>(out: &mut [T], accum: Accum, parts: &[Tensor<T>]) {
-    const CHUNK: usize = 1 << 14;
+    let chunk = regime::size(1 << 14);
     let work = out.len() * parts.len();
-    parallel::for_each_chunk(out, CHUNK, work, |i, out| {
-        let range = i * CHUNK..i * CHUNK + out.len();
+    parallel::for_each_chunk(out, chunk, work, |i, out| {
+        let range = i * chunk..i * chunk + out.len();
         let mut parts = parts.iter().map(|part| &part.data()[range.clone()]);
         simd::dispatch(
             #[inline(always)]
@@ -88,13 +88,13 @@ pub(in crate::ops) fn sum_into<T: Float>(out: &mut [T], accum: Accum, parts: &[T
 
 /// The sum of the rows of `g`, or added to what is there: the gradient of a bias. In blocks of rows.
 pub(in crate::ops) fn bias_gradient<T: Float>(out: &mut [T], accum: Accum, g: Rows<T>) {
-    const BLOCK: usize = 256;
+    let block = regime::size(256);
     assert_eq!(out.len(), g.cols, "a bias for each channel");
     if out.is_empty() {
         return;
     }
-    let blocks = parallel::map(g.rows.div_ceil(BLOCK), g.rows * g.cols, |i| {
-        let rows = g.rows(i * BLOCK, BLOCK.min(g.rows - i * BLOCK));
+    let blocks = parallel::map(g.rows.div_ceil(block), g.rows * g.cols, |i| {
+        let rows = g.rows(i * block, block.min(g.rows - i * block));
         Tensor::build([g.cols], |sum| {
             sum.fill(T::ZERO);
             for row in rows.data.chunks(rows.row_stride).take(rows.rows) {

@@ -1,5 +1,7 @@
 //! How much work a thread gets at a time.
 
+use crate::tensor::regime;
+
 /// Rows (of pixels, tokens or samples: each op says which) that are handed to a thread at a time.
 ///
 /// The default is chosen by the op for the shapes it sees, about as much as stays in an inner cache. A gradient check
@@ -24,6 +26,6 @@ impl Tile {
     /// The rows: those given, or else those chosen.
     #[inline(always)]
     pub(in crate::ops) fn or(self, chosen: usize) -> usize {
-        if self.0 > 0 { self.0 } else { chosen }
+        if self.0 > 0 { self.0 } else { regime::size(chosen) }
     }
 }

@@ -9,7 +9,7 @@ use crate::ops::support::sums::sum_into;
 use crate::tensor::gemm::{Rows, RowsMut, gemm};
 use crate::tensor::pool::Buffer;
 use crate::tensor::simd::copy_run;
-use crate::tensor::{Accum, Float, Tensor, parallel, simd};
+use crate::tensor::{Accum, Float, Tensor, parallel, regime, simd};
 
 /// Fills the im2col rows of the output pixels of row `oy`, for one group: `[out width, patch]`.
 fn im2col<T: Float>(g: &Geometry, image: &[T], oy: usize, group: usize, patches: &mut [T]) {
@@ -122,11 +122,12 @@ fn turned<T: Float>(g: &Geometry, w: &[T]) -> Buffer<T> {
         let from = &w[(taps - 1 - tap) * cg * g.out_channels..][..cg * g.out_channels];
         for group in 0..g.groups {
             // Some channels at a time, which stay in the cache for all the outputs.
-            for first in (0..cg).step_by(TURNED) {
+            for channels in regime::blocks(0..cg, TURNED) {
+                let first = channels.start;
                 for (j, row) in block.chunks_exact_mut(g.channels).enumerate() {
                     let row = &mut row[group * cg + first..(group + 1) * cg];
                     let column = from[first * g.out_channels..][group * ng + j..].iter().step_by(g.out_channels);
-                    row.iter_mut().take(TURNED).zip(column).for_each(|(v, &w)| *v = w);
+                    row.iter_mut().take(channels.len()).zip(column).for_each(|(v, &w)| *v = w);
                 }
             }
         }

@@ -1,0 +1,86 @@
+//! Regimes of size: where a kernel stops doing everything in one piece.
+//!
+//! Chunks, tiles, blocks and partial sums have sizes that suit caches, far above those of inputs that finite differences
+//! can afford. What begins behind such a boundary (the second chunk, the last one that is shorter) would be compared with
+//! nothing. So every size at which kernels cut their work is asked for here ([`size`]), where a gradient check can make
+//! it small ([`shrink`]), and every cut is noted with its place in the source for whoever listens ([`record`]): the suite
+//! sees which cuts its cases crossed, and refuses those that none did.
+
+use std::cell::RefCell;
+use std::ops::Range;
+use std::panic::Location;
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+
+/// The largest size of a piece; none if 0.
+static LARGEST: AtomicUsize = AtomicUsize::new(0);
+
+/// The size at which a kernel cuts its work, in its own unit: `usual`, unless a check has made it smaller.
+#[inline(always)]
+pub fn size(usual: usize) -> usize {
+    match LARGEST.load(Relaxed) {
+        0 => usual,
+        largest => usual.min(largest),
+    }
+}
+
+/// Makes every piece of work in this process at most `largest` units; 0 for the usual sizes. For checks alone: sums are
+/// added in another order then, and so have other last bits.
+pub fn shrink(largest: usize) {
+    LARGEST.store(largest, Relaxed);
+}
+
+/// One cut that a kernel made: its place in the source, and how many pieces there were.
+#[derive(Clone, Copy, Debug)]
+pub struct Cut {
+    /// The call that cut.
+    pub place: &'static Location<'static>,
+    /// Number of pieces.
+    pub pieces: usize,
+    /// Whether the last piece was shorter than the others, where that is known.
+    pub rest: Option<bool>,
+}
+
+thread_local! {
+    static CUTS: RefCell<Option<Vec<Cut>>> = const { RefCell::new(None) };
+}
+
+/// Runs `f`, and returns the cuts that kernels made meanwhile on this thread: all of them, if kernels run on one
+/// ([`with_threads`](super::parallel::with_threads)).
+pub fn record<R>(f: impl FnOnce() -> R) -> (R, Vec<Cut>) {
+    let before = CUTS.replace(Some(Vec::new()));
+    let result = f();
+    (result, CUTS.replace(before).unwrap_or_default())
+}
+
+/// Notes a cut.
+pub(crate) fn note(place: &'static Location<'static>, pieces: usize, rest: Option<bool>) {
+    CUTS.with_borrow_mut(|cuts| {
+        if let Some(cuts) = cuts {
+            cuts.push(Cut { place, pieces, rest });
+        }
+    });
+}
+
+/// Cuts a range into runs of `usual` (see [`size`]), the last of which may be shorter: for loops inside a thread.
+#[track_caller]
+pub fn blocks(range: Range<usize>, usual: usize) -> impl Iterator<Item = Range<usize>> {
+    let block = size(usual).max(1);
+    note(Location::caller(), range.len().div_ceil(block), Some(range.len() % block != 0));
+    range.clone().step_by(block).map(move |first| first..(first + block).min(range.end))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn blocks_cover_a_range_once_and_are_noted() {
+        let (found, cuts) = record(|| blocks(3..13, 4).collect::<Vec<_>>());
+        assert_eq!(found, [3..7, 7..11, 11..13]);
+        assert_eq!((cuts.len(), cuts[0].pieces, cuts[0].rest), (1, 3, Some(true)));
+        assert!(cuts[0].place.file().ends_with("regime.rs"));
+        assert_eq!(blocks(5..5, 4).count(), 0);
+        let (_, cuts) = record(|| blocks(0..8, 4).count());
+        assert_eq!((cuts[0].pieces, cuts[0].rest), (2, Some(false)));
+    }
+}
