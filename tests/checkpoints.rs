@@ -2,7 +2,7 @@
 //! what was written, and bad files are refused by name, quickly and in little memory.
 #![cfg(feature = "cli")]
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::time::{Duration, Instant};
@@ -12,6 +12,7 @@ use parallax::formats::pth;
 use parallax::formats::pth::Saved;
 use parallax::monovit::{MonoVit, Preset};
 use parallax::nn::Params;
+use parallax::tensor::Tensor;
 use parallax::train::RunConfig;
 use parallax::train::run::load_weights;
 use parallax::train::start::Start;
@@ -609,4 +610,78 @@ fn what_stands_beside_the_weights_never_blocks_a_file() {
         files += 1;
     }
     assert_eq!(files, 10);
+}
+
+/// The pose decoder's tensors under other names, in a file of this program's format.
+fn renamed(folder: &Path, name: &str, names: &[(&str, f32)]) -> PathBuf {
+    let beside = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/pth/beside/pose.safetensors");
+    let plain = parallax::formats::safetensors::read::<f32>(&beside).expect("the weights alone").tensors;
+    let mut tensors = BTreeMap::new();
+    for (front, factor) in names {
+        for (name, tensor) in &plain {
+            let own = name.strip_prefix("pose.").unwrap_or(name);
+            let scaled = Tensor::build(*tensor.shape(), |out| {
+                out.iter_mut().zip(tensor.data()).for_each(|(o, x)| *o = factor * x);
+            });
+            tensors.insert(format!("{front}{own}"), scaled);
+        }
+    }
+    let path = folder.join(format!("{name}.safetensors"));
+    parallax::formats::safetensors::write(&path, &tensors, HashMap::new()).expect("written");
+    path
+}
+
+#[test]
+fn weights_are_found_whatever_wraps_them() {
+    let place = tempfile::tempdir().expect("a folder");
+    let load = |path: &Path| parallax::weights::load(&[path.to_owned()], Need::Only("pose"), false);
+    let bias = |weights: &parallax::weights::Weights| weights.params.export()["pose.net.3.bias"].data()[0];
+    let plain = bias(&load(&renamed(place.path(), "plain", &[("pose.", 1.0)])).expect("plain"));
+    for front in ["", "module.", "net.pose.", "models.pose.", "generator.", "student.", "trainer.nets.pose_net."] {
+        let weights =
+            load(&renamed(place.path(), "wrapped", &[(front, 1.0)])).unwrap_or_else(|e| panic!("{front}: {e}"));
+        assert_eq!(bias(&weights), plain, "{front}");
+    }
+    // Averages are taken where there is nothing else; beside plain weights they are passed over, with a word.
+    let alone = load(&renamed(place.path(), "alone", &[("ema.", 2.0)])).expect("averages alone");
+    assert_eq!(bias(&alone), 2.0 * plain);
+    let both = renamed(place.path(), "both", &[("model.", 1.0), ("model_ema.", 2.0)]);
+    let weights = load(&both).expect("the plain ones");
+    assert_eq!(bias(&weights), plain);
+    let said = weights.report.to_string();
+    assert!(said.contains("averaged weights: the plain ones are taken (convert --averaged takes these)"), "{said}");
+    let sources = parallax::weights::Sources::open_averaged(&[both]).expect("opened");
+    let weights = parallax::weights::load_from(&sources, Need::Only("pose"), false).expect("the averages");
+    assert_eq!(bias(&weights), 2.0 * plain);
+    // Twice the same parameter with other numbers, and nothing that says which: an error.
+    let error = load(&renamed(place.path(), "two", &[("a.", 1.0), ("b.", 2.0)])).err().expect("two").to_string();
+    assert!(error.contains("a.net") && error.contains("b.net"), "{error}");
+}
+
+#[test]
+fn a_name_that_stands_twice_and_a_bit_that_turned_are_refused_by_name() {
+    let place = tempfile::tempdir().expect("a folder");
+    let path = renamed(place.path(), "whole", &[("pose.", 1.0)]);
+    let bytes = std::fs::read(&path).expect("read");
+    let load = |bytes: &[u8]| {
+        let path = place.path().join("changed.safetensors");
+        std::fs::write(&path, bytes).expect("written");
+        parallax::weights::load(&[path], Need::Only("pose"), false).err().map(|e| e.to_string())
+    };
+    assert_eq!(load(&bytes), None);
+    let mut turned = bytes.clone();
+    let last = turned.len() - 5;
+    turned[last] ^= 1;
+    let error = load(&turned).expect("refused");
+    assert!(error.contains("changed.safetensors") && error.contains("checksum"), "{error}");
+    // The same entry once more in the header: JSON readers would keep one of them without a word.
+    let length = u64::from_le_bytes(bytes[..8].try_into().expect("eight")) as usize;
+    let header = std::str::from_utf8(&bytes[8..8 + length]).expect("text").trim_end();
+    let at = header.find("\"pose.net.0.bias\"").expect("the entry");
+    let entry = &header[at..=at + header[at..].find('}').expect("its end")];
+    let mut twice = format!("{},{entry}}}", &header[..header.len() - 1]).into_bytes();
+    twice.resize(twice.len().next_multiple_of(8), b' ');
+    let file = [&(twice.len() as u64).to_le_bytes()[..], &twice, &bytes[8 + length..]].concat();
+    let error = load(&file).expect("refused");
+    assert!(error.contains("pose.net.0.bias twice"), "{error}");
 }

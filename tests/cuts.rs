@@ -15,10 +15,14 @@ const SEED: u64 = 1;
 const SIZES: [usize; 5] = [1, 2, 3, 5, 8];
 const THREADS: [usize; 3] = [2, 3, 8];
 /// Largest error of an f32 output or gradient, of the largest number in it.
-const SINGLE: f64 = 2e-5;
+const SINGLE: f64 = 1e-4;
 
-/// Cuts that no case crosses three times, and why that is so.
-const UNCROSSED: [(&str, &str, &str); 0] = [];
+/// Whose cut it is: an op's own, or one of code that several ops share, which any of them may cross for all.
+fn owner(op: &'static str, place: &str) -> &'static str {
+    let shared = ["tensor/", "ops/support/", "ops/reduce/axis_loops"].iter().any(|folder| place.starts_with(folder));
+    let borrowed = op != "conv2d" && place.starts_with("ops/conv/conv2d/");
+    if shared || borrowed { "(shared)" } else { op }
+}
 
 /// Outputs, and the gradients of the tracked inputs.
 type Outcome<T> = (Vec<Tensor<T>>, Vec<Option<Tensor<T>>>);
@@ -156,7 +160,8 @@ impl Suite {
                 parallel::with_threads(1, || regime::record(|| outcome(&run, &inputs, &tracked, &seeds, None)));
             for cut in &cuts {
                 let file = cut.place.file().rsplit_once("src/").map_or(cut.place.file(), |(_, file)| file);
-                self.table.entry((case.op(), format!("{file}:{}", cut.place.line()))).or_default().add(cut);
+                let place = format!("{file}:{}", cut.place.line());
+                self.table.entry((owner(case.op(), &place), place)).or_default().add(cut);
             }
             let mut fail = |why: String| self.failures.push(format!("{name}, pieces of {size}: {why}"));
             // The gradients, by the differences of the usual sizes; the values, by the usual ones.
@@ -223,8 +228,7 @@ fn every_piece_of_work_is_checked() {
         let Crossed { cases, most, shorter, whole, by_length } = crossed;
         println!("{op:24} {place:40} {cases:5} times, at most {most:5} pieces");
         let enough = *most > 2 && (!by_length || (*shorter && *whole));
-        let excused = UNCROSSED.iter().any(|(o, p, _)| o == op && place.starts_with(p));
-        if !enough && !excused {
+        if !enough {
             failures.push(format!(
                 "{op}: the cut at {place} has at most {most} pieces, a shorter last one: {shorter}, a whole one: {whole}"
             ));

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use parallax::monovit::setup::check_size;
 use parallax::weights;
-use parallax::weights::{Form, Need};
+use parallax::weights::{Form, Need, Sources};
 use parallax::{Error, Result};
 
 #[derive(clap::Args)]
@@ -25,6 +25,10 @@ pub struct Args {
     /// Width of the pictures that the network saw [default: that of the weights].
     #[arg(long, value_name = "PIXELS")]
     width: Option<usize>,
+    /// Of files that hold weights twice, as they are and averaged over steps, take the averaged ones [default: the plain
+    /// ones].
+    #[arg(long)]
+    averaged: bool,
     /// Replace what stands at OUT.
     #[arg(long)]
     force: bool,
@@ -38,7 +42,8 @@ pub fn run(args: Args) -> Result<()> {
         size.map_or(Ok(()), |size| check_size(name, size))?;
     }
     let form = Form::of(&args.out)?;
-    let mut weights = weights::load(&args.inputs, Need::Any, args.allow_partial)?;
+    let open = if args.averaged { Sources::open_averaged } else { Sources::open };
+    let mut weights = weights::load_from(&open(&args.inputs)?, Need::Any, args.allow_partial)?;
     weights.setup.height = args.height.unwrap_or(weights.setup.height);
     weights.setup.width = args.width.unwrap_or(weights.setup.width);
     let outputs = weights::outputs(&weights, &args.out, form);

@@ -35,8 +35,11 @@ impl WeightsArgs {
     pub fn load(&self) -> Result<Weights> {
         self.check()?;
         let mut weights = weights::load(&self.weights, Need::Depth, self.allow_partial)?;
+        let averaged = weights.report.skipped.iter().find(|s| s.what.contains("averaged"));
         if weights.report.problem().is_some() {
             note!("{}", weights.report);
+        } else if let Some(skipped) = averaged {
+            note!("passed over {} and others: {}", skipped.name, skipped.what);
         }
         weights.setup.height = self.height.unwrap_or(weights.setup.height);
         weights.setup.width = self.width.unwrap_or(weights.setup.width);

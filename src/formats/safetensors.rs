@@ -1,12 +1,15 @@
 //! Checkpoints as safetensors, in PyTorch's names and layouts, so that one file serves both sides.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::fmt;
 use std::fs::File;
 use std::io::{Read, Write};
 use std::path::Path;
 use std::sync::Arc;
 
 use safetensors::tensor::{Dtype, Metadata};
+use serde::Deserializer;
+use serde::de::{IgnoredAny, MapAccess, Visitor};
 
 use super::atomic::write_atomically;
 use super::pth::shown;
@@ -104,6 +107,10 @@ pub fn open(path: &Path) -> Result<TensorFile> {
     }
     let mut header = Vec::new();
     (&mut file).take(length).read_to_end(&mut header).map_err(io)?;
+    if let Some(name) = duplicate(&header) {
+        let message = format!("its safetensors header has the name {} twice, which the format forbids", shown(&name));
+        return Err(Error::file(path, message));
+    }
     let header: Metadata =
         serde_json::from_slice(&header).map_err(|e| Error::file(path, format!("its safetensors header: {e}")))?;
     let claimed = header.data_len() as u64;
@@ -121,7 +128,7 @@ pub fn open(path: &Path) -> Result<TensorFile> {
     if let Some(said) = metadata.get(CHECKSUM)
         && *said != format!("{:08x}", crc32fast::hash(&bytes))
     {
-        let message = "is damaged: its numbers are not those that its checksum was made of. Copy or download it again";
+        let message = "is damaged: its numbers are not those that its checksum was made of. Copy or download it again; if another program rewrote it, save it there without the metadata entry parallax_crc32";
         return Err(Error::file(path, message));
     }
     let bytes = Arc::new(bytes);
@@ -139,6 +146,29 @@ pub fn open(path: &Path) -> Result<TensorFile> {
         tensors.push((name, tensor));
     }
     Ok(TensorFile { path: path.to_owned(), tensors, integers: Vec::new(), metadata })
+}
+
+/// A name that stands twice in a JSON object; of repeated keys a JSON reader keeps the last.
+fn duplicate(header: &[u8]) -> Option<String> {
+    struct Names(Option<String>);
+    impl<'de> Visitor<'de> for Names {
+        type Value = Option<String>;
+        fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
+            f.write_str("an object")
+        }
+        fn visit_map<A: MapAccess<'de>>(mut self, mut map: A) -> Result<Self::Value, A::Error> {
+            let mut seen = HashSet::new();
+            while let Some(name) = map.next_key::<String>()? {
+                map.next_value::<IgnoredAny>()?;
+                if !seen.insert(name.clone()) {
+                    self.0.get_or_insert(name);
+                }
+            }
+            Ok(self.0)
+        }
+    }
+    // What is no object is reported by who reads it.
+    serde_json::Deserializer::from_slice(header).deserialize_map(Names(None)).ok().flatten()
 }
 
 fn dtype(theirs: Dtype) -> Option<stored::Dtype> {

@@ -86,17 +86,7 @@ fn split<T: Send>(data: &mut [T], chunk: usize, first: usize, f: &(dyn Fn(usize,
 
 /// The one place where work is handed over. The kernel comes as a `dyn Fn`: it is compiled once, not once for each way
 /// of running it, and the machinery once for each element type.
-///
-/// It notes how often and where work was cut, for the checks that ask ([`regime`]).
-fn run<T: Send>(
-    data: &mut [T],
-    chunk: usize,
-    work: usize,
-    place: &'static Location<'static>,
-    f: &(dyn Fn(usize, &mut [T]) + Sync),
-) {
-    let rest = (size_of::<T>() > 0).then(|| !data.len().is_multiple_of(chunk));
-    regime::note(place, data.len().div_ceil(chunk), rest);
+fn cut<T: Send>(data: &mut [T], chunk: usize, work: usize, f: &(dyn Fn(usize, &mut [T]) + Sync)) {
     if stays(data.len().div_ceil(chunk), work) {
         data.chunks_mut(chunk).enumerate().for_each(|(i, c)| f(i, c));
     } else {
@@ -113,7 +103,8 @@ pub fn for_each(count: usize, work: usize, f: impl Fn(usize) + Sync + Send) {
 
 /// Nothing to be cut but the indices: the threads' machinery is compiled once for all that runs by index.
 fn indices(count: usize, work: usize, place: &'static Location<'static>, f: &(dyn Fn(usize) + Sync)) {
-    run(&mut vec![(); count], 1, work, place, &|i, _| f(i));
+    regime::note(place, count, None);
+    cut(&mut vec![(); count], 1, work, &|i, _| f(i));
 }
 
 /// Collects `f(i)` for every i below `count`, in order.
@@ -127,7 +118,21 @@ pub fn map<R: Send>(count: usize, work: usize, f: impl Fn(usize) -> R + Sync + S
 /// Cuts `data` into chunks of `chunk` elements (the last may be shorter) and calls `f(index, chunk)` for each.
 #[track_caller]
 pub fn for_each_chunk<T: Send>(data: &mut [T], chunk: usize, work: usize, f: impl Fn(usize, &mut [T]) + Sync + Send) {
-    run(data, chunk.max(1), work, Location::caller(), &f);
+    let chunk = chunk.max(1);
+    regime::note(Location::caller(), data.len().div_ceil(chunk), Some(!data.len().is_multiple_of(chunk)));
+    cut(data, chunk, work, &f);
+}
+
+/// Cuts `data` into units of `unit` elements each (rows, images, matrices) and calls `f(index, unit)` for each.
+///
+/// # Panics
+/// If units do not fill the data.
+#[track_caller]
+pub fn for_each_unit<T: Send>(data: &mut [T], unit: usize, work: usize, f: impl Fn(usize, &mut [T]) + Sync + Send) {
+    assert!(data.len().is_multiple_of(unit.max(1)), "{} elements in units of {unit}", data.len());
+    let place = Location::caller();
+    regime::note(place, data.len() / unit.max(1), None);
+    cut(data, unit.max(1), work, &f);
 }
 
 /// Calls `f` for every piece: for kernels that write several slices, cut and zipped by the caller.

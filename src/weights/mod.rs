@@ -50,7 +50,14 @@ pub struct Weights {
 /// As [`Sources::open`], [`Sources::setup`] and [`Sources::fill`]; if the tensors are of another size than the
 /// configuration beside them, unless `allow_partial`.
 pub fn load(paths: &[PathBuf], need: Need, allow_partial: bool) -> Result<Weights> {
-    let sources = Sources::open(paths)?;
+    load_from(&Sources::open(paths)?, need, allow_partial)
+}
+
+/// [`load`], from sources that are open.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_from(sources: &Sources, need: Need, allow_partial: bool) -> Result<Weights> {
     let setup = sources.setup(need)?;
     // Of a network that is not wholly a preset, tensor by tensor will do.
     if !allow_partial && setup.ablation == Ablation::default() {

@@ -39,17 +39,64 @@ pub(super) enum Place {
     Unknown,
 }
 
-/// A name without the wrappers in front of it.
-pub(super) fn unwrapped(mut name: &str) -> &str {
-    while let Some(rest) = WRAPPERS.iter().find_map(|w| name.strip_prefix(w)) {
-        name = rest;
+/// What stands in front of weights that were averaged over steps.
+const AVERAGES: [&str; 12] = [
+    "ema.",
+    "model_ema.",
+    "ema_model.",
+    "ema_state_dict.",
+    "state_dict_ema.",
+    "swa.",
+    "swa_model.",
+    "averaged_model.",
+    "average_model.",
+    "avg_model.",
+    "shadow.",
+    "shadow_params.",
+];
+
+/// A name without the wrappers in front of it, and whether they say that its tensor is an average over steps.
+pub(super) fn unwrapped(mut name: &str) -> (&str, bool) {
+    let mut averaged = false;
+    loop {
+        if let Some(rest) = WRAPPERS.iter().find_map(|w| name.strip_prefix(w)) {
+            name = rest;
+        } else if let Some(rest) = AVERAGES.iter().find_map(|w| name.strip_prefix(w)) {
+            (name, averaged) = (rest, true);
+        } else {
+            return (name, averaged);
+        }
     }
-    name
+}
+
+/// The prefixes that wrap a whole model, whatever they are called: everything that begins with one, and nothing else of
+/// the file, has a place once it is taken off. `unknown` are the names that have none as they are.
+pub(super) fn wrappers<'a>(unknown: &[&'a str]) -> Vec<&'a str> {
+    const DEEPEST: usize = 4;
+    /// More than all networks of a file have; each is compared with all.
+    const MOST: usize = 4096;
+    if unknown.len() > MOST {
+        return Vec::new();
+    }
+    let mut found: Vec<&str> = Vec::new();
+    for name in unknown {
+        if found.iter().any(|prefix| name.starts_with(prefix)) {
+            continue;
+        }
+        let ends = name.match_indices('.').map(|(dot, _)| dot + 1).take(DEEPEST);
+        let mut prefixes = ends.map(|end| &name[..end]);
+        let wraps = |prefix: &&str| {
+            let mut under = unknown.iter().filter_map(|other| other.strip_prefix(*prefix)).map(place).peekable();
+            under.peek().is_some() && under.all(|place| place != Place::Unknown)
+        };
+        found.extend(prefixes.find(wraps));
+    }
+    found
 }
 
 /// What the tensor of this name is.
 pub(super) fn place(name: &str) -> Place {
-    let name = unwrapped(name);
+    let (name, _) = unwrapped(name);
     if name == "num_batches_tracked" || name.ends_with(".num_batches_tracked") {
         return Place::Useless("counters of batches");
     }
@@ -120,6 +167,21 @@ pub(super) static DECODER_KEYS: LazyLock<Vec<String>> = LazyLock::new(|| {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn whatever_wraps_a_whole_model_is_a_wrapper() {
+        let generator = ["generator.stem.0.conv.weight", "generator.convs.f4.conv_se.bias"];
+        assert_eq!(wrappers(&generator), ["generator."]);
+        let deep = ["trainer.nets.pose_net.net.0.bias", "trainer.nets.pose_net.net.1.bias"];
+        assert_eq!(wrappers(&deep), ["trainer.nets.pose_net."]);
+        // Another network that happens to have a layer of a name that is known.
+        let other = ["discriminator.conv1.weight", "discriminator.conv9.weight"];
+        assert_eq!(wrappers(&other), [""; 0]);
+        assert_eq!(unwrapped("module.ema_state_dict.stem.0.x"), ("stem.0.x", true));
+        assert_eq!(unwrapped("models.stem.0.x"), ("stem.0.x", false));
+        // Neither depth nor length costs much.
+        assert_eq!(wrappers(&["a.".repeat(1 << 16).as_str()]), [""; 0]);
+    }
 
     #[test]
     fn every_arrangement_has_its_place() {

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use super::names::{NETWORKS, Place, place, unwrapped};
+use super::names::{NETWORKS, Place, place, unwrapped, wrappers};
 use super::sizes::Sizes;
 use crate::error::{Error, Result};
 use crate::formats::TensorFile;
@@ -56,6 +56,18 @@ impl Sources {
     /// # Errors
     /// Names the file that cannot be read, or the folder without weights.
     pub fn open(paths: &[PathBuf]) -> Result<Self> {
+        Self::open_either(paths, false)
+    }
+
+    /// [`open`](Sources::open), for files that hold weights twice, as they are and averaged over steps: the averaged ones.
+    ///
+    /// # Errors
+    /// As [`open`](Sources::open).
+    pub fn open_averaged(paths: &[PathBuf]) -> Result<Self> {
+        Self::open_either(paths, true)
+    }
+
+    fn open_either(paths: &[PathBuf], averaged: bool) -> Result<Self> {
         let mut sources = Sources {
             paths: paths.to_vec(),
             tensors: Vec::new(),
@@ -67,23 +79,49 @@ impl Sources {
         for path in paths {
             let files = if path.is_dir() { files_of(path)? } else { vec![path.clone()] };
             for file in files {
-                sources.add(TensorFile::open(&file)?)?;
+                sources.add(TensorFile::open(&file)?, averaged)?;
             }
         }
         Ok(sources)
     }
 
-    fn add(&mut self, file: TensorFile) -> Result<()> {
+    fn add(&mut self, file: TensorFile, averaged: bool) -> Result<()> {
         let path = Arc::new(file.path);
+        let unknown: Vec<&str> =
+            file.tensors.iter().map(|(n, _)| n.as_str()).filter(|n| place(n) == Place::Unknown).collect();
+        let wrappers: Vec<String> = wrappers(&unknown).into_iter().map(str::to_owned).collect();
+        // The tensors of the networks, plain and averaged.
+        let mut both: [Vec<Named>; 2] = [Vec::new(), Vec::new()];
         for (origin, tensor) in file.tensors {
-            match place(&origin) {
-                Place::Model(name) => self.tensors.push(Named { name, origin, file: path.clone(), tensor }),
-                Place::Useless(what) => self.skipped.push(Skipped { name: shown(&origin), what }),
-                Place::Unknown => self.unexpected.push(shown(&origin)),
+            let known = match place(&origin) {
+                Place::Unknown => wrappers.iter().find_map(|w| origin.strip_prefix(w.as_str())).map(place),
+                known => Some(known),
+            };
+            match known {
+                Some(Place::Model(name)) => {
+                    let of = usize::from(unwrapped(&origin).1);
+                    both[of].push(Named { name, origin, file: path.clone(), tensor });
+                }
+                Some(Place::Useless(what)) => self.skipped.push(Skipped { name: shown(&origin), what }),
+                Some(Place::Unknown) | None => self.unexpected.push(shown(&origin)),
             }
         }
+        let [plain, average] = both;
+        if plain.is_empty() || average.is_empty() {
+            self.tensors.extend(plain);
+            self.tensors.extend(average);
+        } else {
+            let (taken, left, what) = match averaged {
+                true => (average, plain, "plain weights: the averaged ones are taken"),
+                false => {
+                    (plain, average, "averaged weights: the plain ones are taken (convert --averaged takes these)")
+                }
+            };
+            self.tensors.extend(taken);
+            self.skipped.extend(left.into_iter().map(|t| Skipped { name: shown(&t.origin), what }));
+        }
         for (slot, what) in self.size.iter_mut().zip(["height", "width"]) {
-            let said = file.integers.iter().find(|(name, _)| unwrapped(name) == what);
+            let said = file.integers.iter().find(|(name, _)| unwrapped(name).0 == what);
             if let (None, Some((_, pixels))) = (*slot, said) {
                 let pixels = usize::try_from(*pixels).unwrap_or(0);
                 check_size(what, pixels).map_err(|e| Error::file(&*path, e.to_string()))?;

@@ -130,7 +130,7 @@ impl<T: Float> Op<T> for FactorisedAttention {
         let (size, tiles) = (channels * heads.c, e.tiles());
         let factor = T::of((heads.c as f64).powf(-0.5));
         let mut parts = Buffer::<T>::stale(e.batch * tiles * size);
-        parallel::for_each_chunk(&mut parts, size, 2 * g.len() * heads.c, |i, part| {
+        parallel::for_each_unit(&mut parts, size, 2 * g.len() * heads.c, |i, part| {
             let (b, tile) = (i / tiles, i % tiles);
             heads.outer(part, e.rows(qkv, stride, b, tile, 0), e.rows(g, channels, b, tile, 0));
         });
@@ -210,7 +210,7 @@ fn contexts<T: Float>(e: &Extents, qkv: &[T]) -> (Statistics<T>, Buffer<T>) {
     let (heads, channels, stride) = (e.heads, e.heads.channels(), 3 * e.heads.channels());
     let (size, tiles) = (channels * heads.c, e.tiles());
     let mut parts = Buffer::<T>::stale(e.batch * tiles * (2 * channels + size));
-    parallel::for_each_chunk(&mut parts, 2 * channels + size, qkv.len() * (8 + heads.c), |i, part| {
+    parallel::for_each_unit(&mut parts, 2 * channels + size, qkv.len() * (8 + heads.c), |i, part| {
         let (b, tile) = (i / tiles, i % tiles);
         let k = e.rows(qkv, stride, b, tile, channels);
         let (max, rest) = part.split_at_mut(channels);

@@ -145,7 +145,7 @@ impl Plan {
         let (height, pad) = (self.padded_height(), self.pad);
         let mut out = Buffer::stale(self.batch * height * self.blocks.len() * across);
         let work = out.len();
-        parallel::for_each_chunk(&mut out, self.blocks.len() * across, work, |i, out| {
+        parallel::for_each_unit(&mut out, self.blocks.len() * across, work, |i, out| {
             let (b, y) = (i / height, i % height);
             if !(pad..pad + self.height).contains(&y) {
                 return out.fill(T::ZERO);
@@ -392,7 +392,7 @@ impl<T: Float> Op<T> for ConvRelativePosition {
         sink.accumulate(0, |out, accum| {
             let conv = conv.as_ref().expect("saved for the gradient of q");
             let taps = plan.arrange(&weights, true);
-            parallel::for_each_chunk(out, plan.width * stride, work, |i, out| {
+            parallel::for_each_unit(out, plan.width * stride, work, |i, out| {
                 let first = i * plan.width * channels;
                 let rows = g[first..].chunks_exact(channels).zip(conv[first..].chunks_exact(channels));
                 for (out, (g, conv)) in out.chunks_exact_mut(stride).zip(rows) {
@@ -431,7 +431,7 @@ fn parameters<T: Float>(plan: &Plan, image: &[T], u: &[T], work: usize, sink: &m
     let (tiles, lanes) = (plan.height.div_ceil(plan.tile), plan.blocks.len() * LANES);
     let size = plan.taps * LANES + lanes;
     let mut parts = Buffer::<T>::stale(plan.batch * tiles * size);
-    parallel::for_each_chunk(&mut parts, size, work, |i, part| {
+    parallel::for_each_unit(&mut parts, size, work, |i, part| {
         let (b, first) = (i / tiles, i % tiles * plan.tile);
         let rows = first..(first + plan.tile).min(plan.height);
         let (taps, bias) = part.split_at_mut(plan.taps * LANES);

@@ -225,6 +225,7 @@ impl Checked for ConvTranspose2d {
             case("one pixel is left", padded(1), [1, 1, 1, 2], [3, 3, 2, 2], false),
             case("1x1", plain, [2, 3, 2, 3], [1, 1, 4, 3], true),
             case("1x1, stride 2", by(2), [2, 3, 2, 3], [1, 1, 2, 3], false),
+            case("three images, stride 2", by(2), [3, 2, 3, 2], [3, 3, 2, 2], true),
             case("tile less one", ConvTranspose2d { tile: Tile::of(4), ..by(2) }, [1, 3, 2, 2], [3, 3, 2, 2], false),
             case("a whole tile", ConvTranspose2d { tile: Tile::of(4), ..by(2) }, [1, 4, 2, 2], [3, 3, 2, 2], false),
             case("tile and one", ConvTranspose2d { tile: Tile::of(4), ..by(2) }, [1, 5, 2, 2], [3, 3, 2, 2], false),

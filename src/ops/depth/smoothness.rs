@@ -135,7 +135,7 @@ impl<T: Float> Op<T> for Smoothness {
             terms.for_each(|((o, (&a, &b)), &e)| difference(b - a, e, o));
         };
         sink.accumulate(0, |out, accum| {
-            parallel::for_each_chunk(out, width, 16 * disparity.len(), |i, out| {
+            parallel::for_each_unit(out, width, 16 * disparity.len(), |i, out| {
                 let (b, row) = (i / height, i % height);
                 let [mean, sum] = samples[b];
                 let mut slopes = Buffer::stale(width);
@@ -160,7 +160,7 @@ impl<T: Float> Op<T> for Smoothness {
             });
         });
         sink.accumulate(1, |out, accum| {
-            parallel::for_each_chunk(out, width * channels, 16 * image.len(), |i, out| {
+            parallel::for_each_unit(out, width * channels, 16 * image.len(), |i, out| {
                 let (b, row) = (i / height, i % height);
                 let mut slopes = Buffer::stale(width);
                 begin_sum(out, accum);

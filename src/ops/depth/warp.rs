@@ -371,7 +371,7 @@ impl Warp {
         out: &mut [T],
         accum: Accum,
     ) {
-        parallel::for_each_chunk(out, e.image(), 32 * g.len(), |b, out| {
+        parallel::for_each_unit(out, e.image(), 32 * g.len(), |b, out| {
             begin_sum(out, accum);
             let p = self.projection(b, transform.data(), e.height, e.width);
             let mut places = Places::new();
@@ -473,22 +473,27 @@ impl<T: Float> Op<T> for Warp {
 
 impl Checked for Warp {
     fn cases() -> Vec<Case<Self>> {
-        // The camera of a small image, and a second one with another focal length and centre.
+        // The camera of a small image, and two more with other focal lengths and centres.
         let intrinsics = |height: usize, width: usize| {
             let (w, h) = (width as f64, height as f64);
-            vec![[0.58 * w, 1.92 * h, 0.5 * w, 0.5 * h], [0.7 * w, 1.5 * h, 0.45 * w, 0.6 * h]]
+            let [first, second] = [[0.58 * w, 1.92 * h, 0.5 * w, 0.5 * h], [0.7 * w, 1.5 * h, 0.45 * w, 0.6 * h]];
+            vec![first, second, [0.9 * w, 1.1 * h, 0.55 * w, 0.4 * h]]
         };
         let pose = [
             [0.999, -0.02, 0.04, 0.3, 0.021, 0.9995, -0.015, -0.1, -0.039, 0.016, 0.999, 0.25],
             [0.998, 0.03, -0.05, -0.4, -0.031, 0.9993, 0.02, 0.05, 0.051, -0.018, 0.9985, -0.3],
+            [0.9985, 0.01, 0.05, 0.2, -0.012, 0.9992, 0.036, 0.2, -0.05, -0.037, 0.998, 0.1],
         ];
-        let transform =
-            |t: usize| Input::values("transform", [2, 3, 4], pose.map(|p| p.map(|x| x * t as f64)).concat());
         // The depth decides which pixels a place lies between: it is fixed, so that none is on the edge of two.
+        let of = |name, consistent, tile, [batch, height, width, channels]: [usize; 4]| {
+            let intrinsics = intrinsics(height, width)[..batch].to_vec();
+            let op = Warp { intrinsics, consistent, tile: Tile::of(tile) };
+            let source = Input::random("source", [batch, height, width, channels]);
+            let depth = Input::fixed("depth", [batch, height, width, 1], 3.0, 6.0);
+            Case::new(name, op, [source, depth, Input::values("transform", [batch, 3, 4], pose[..batch].concat())])
+        };
         let case = |name, consistent, tile, [height, width, channels]: [usize; 3]| {
-            let op = Warp { intrinsics: intrinsics(height, width), consistent, tile: Tile::of(tile) };
-            let source = Input::random("source", [2, height, width, channels]);
-            Case::new(name, op, [source, Input::fixed("depth", [2, height, width, 1], 3.0, 6.0), transform(1)])
+            of(name, consistent, tile, [2, height, width, channels])
         };
         let mut far = case("far outside", false, 0, [4, 5, 3]);
         far.terms.inputs[1] = Input::fixed("depth", [2, 4, 5, 1], 0.2, 1.0);
@@ -501,6 +506,7 @@ impl Checked for Warp {
             case("a whole tile", false, 5, [5, 4, 3]),
             case("tile and one", false, 4, [5, 4, 3]),
             case("wider than a block", false, 0, [2, 67, 3]),
+            of("three cameras", true, 0, [3, 4, 5, 3]),
             far,
         ]
     }

@@ -200,7 +200,7 @@ where
             }
             let slices = Slices::of([a.shape(), b.shape()], &shape);
             let work = out.len();
-            parallel::for_each_chunk(out, slices.result, work, |i, out| {
+            parallel::for_each_unit(out, slices.result, work, |i, out| {
                 let (a, b) = (&a.data()[i * slices.operands[0]..], &b.data()[i * slices.operands[1]..]);
                 simd::dispatch(
                     #[inline(always)]
@@ -258,7 +258,7 @@ where
                 let own = slices.operands[side];
                 let (per_thread, repeats) = if own > 0 { (own, 1) } else { (out.len(), slices.count) };
                 let work = 2 * g.len();
-                parallel::for_each_chunk(out, per_thread, work, |first, out| {
+                parallel::for_each_unit(out, per_thread, work, |first, out| {
                     begin_sum(out, accum);
                     for i in first * repeats..(first + 1) * repeats {
                         let g = &g.data()[i * slices.result..][..slices.result];
@@ -304,6 +304,7 @@ impl<F: Function> Checked for Binary<F> {
             Case::new("one per sample", op, [a(&[2, 3, 2, 2]), b(&[2, 1, 1, 1])]),
             Case::new("one per sample and channel", op, [a(&[2, 3, 2, 2]), b(&[2, 1, 1, 2])]),
             Case::new("one per pixel", op, [a(&[2, 3, 1, 1]), b(&[2, 3, 1, 5])]),
+            Case::new("three samples, stretched", op, [a(&[3, 1, 2]), b(&[3, 2, 1])]),
             Case::new("scalar", op, [a(&[]), b(&[3])]),
             Case::new("two scalars", op, [a(&[]), b(&[])]),
             Case::new("empty", op, [a(&[2, 0]), b(&[1, 1])]).flat(),

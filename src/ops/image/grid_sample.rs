@@ -145,7 +145,7 @@ impl<T: Float> Op<T> for GridSample {
         let [_, rows, cols, _] = grid.shape().nhwc().expect("checked by the shape rule");
         let y = Tensor::build([batch, rows, cols, channels], |out| {
             let work = 16 * out.len();
-            parallel::for_each_chunk(out, cols * channels, work, |i, out| {
+            parallel::for_each_unit(out, cols * channels, work, |i, out| {
                 let image = &x.data()[i / rows * height * width * channels..][..height * width * channels];
                 let grid = &grid.data()[i * cols * 2..][..cols * 2];
                 for (out, g) in out.chunks_exact_mut(channels).zip(grid.chunks_exact(2)) {
@@ -171,7 +171,7 @@ impl<T: Float> Op<T> for GridSample {
         let (size, places) = (height * width * channels, rows * cols);
         sink.accumulate(0, |out, accum| {
             let work = 16 * g.len() + out.len();
-            parallel::for_each_chunk(out, size, work, |b, out| {
+            parallel::for_each_unit(out, size, work, |b, out| {
                 begin_sum(out, accum);
                 let g = &g.data()[b * places * channels..][..places * channels];
                 let grid = &grid.data()[b * places * 2..][..places * 2];
@@ -187,7 +187,7 @@ impl<T: Float> Op<T> for GridSample {
         });
         sink.accumulate(1, |out, accum| {
             let work = 8 * g.len();
-            parallel::for_each_chunk(out, cols * 2, work, |i, out| {
+            parallel::for_each_unit(out, cols * 2, work, |i, out| {
                 let image = &x.data()[i / rows * size..][..size];
                 let grid = &grid.data()[i * cols * 2..][..cols * 2];
                 let g = &g.data()[i * cols * channels..][..cols * channels];
@@ -227,6 +227,7 @@ impl Checked for GridSample {
         let clamped = Input::values("grid", [1, 1, 2, 2], [-1.0, 0.1, 0.3, 1.0]);
         cases.extend([
             Case::new("many channels", op, [Input::random("x", [1, 2, 3, 17]), Input::random("grid", [1, 2, 2, 2])]),
+            Case::new("three images", op, [Input::random("x", [3, 2, 3, 2]), Input::random("grid", [3, 2, 2, 2])]),
             Case::new("on the border", op, [ramp, clamped]).kinks(2).promises(1, [0.0, 16.0, 6.0, 0.0]),
             Case::new(
                 "a single pixel",

@@ -125,7 +125,7 @@ impl<T: Float> Op<T> for MaxPool2d {
         let [_, h, w, _] = shape.nhwc().expect("an image");
         sink.accumulate(0, |out, accum| {
             let work = g.len() * kernel * kernel;
-            parallel::for_each_chunk(out, w * c, work, |i, out| {
+            parallel::for_each_unit(out, w * c, work, |i, out| {
                 let (image, y) = (i / h, i % h + padding);
                 simd::dispatch(
                     #[inline(always)]
@@ -197,7 +197,7 @@ impl<T: Float> Op<T> for AvgPool2d {
         let factor = T::ONE / T::of((kernel * kernel) as f64);
         let y = Tensor::build(shape, |out| {
             let work = out.len() * kernel * kernel;
-            parallel::for_each_chunk(out, ow * c, work, |i, out| {
+            parallel::for_each_unit(out, ow * c, work, |i, out| {
                 let (image, oy) = (i / oh, i % oh);
                 simd::dispatch(
                     #[inline(always)]
@@ -226,7 +226,7 @@ impl<T: Float> Op<T> for AvgPool2d {
         let factor = T::ONE / T::of((kernel * kernel) as f64);
         sink.accumulate(0, |out, accum| {
             let work = g.len() * kernel * kernel;
-            parallel::for_each_chunk(out, w * c, work, |i, out| {
+            parallel::for_each_unit(out, w * c, work, |i, out| {
                 let (image, y) = (i / h, i % h);
                 simd::dispatch(
                     #[inline(always)]

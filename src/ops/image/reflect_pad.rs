@@ -57,7 +57,7 @@ impl<T: Float> Op<T> for ReflectPad {
         let (oh, ow) = (top + h + bottom, left + w + right);
         let y = Tensor::build(x.shape().with(1, oh).with(2, ow), |out| {
             let work = out.len();
-            parallel::for_each_chunk(out, ow * c, work, |i, out| {
+            parallel::for_each_unit(out, ow * c, work, |i, out| {
                 let row = (i / oh * h + reflected(i % oh, top, h)) * w * c;
                 let x = &x.data()[row..][..w * c];
                 out[left * c..(left + w) * c].copy_from_slice(x);
@@ -77,7 +77,7 @@ impl<T: Float> Op<T> for ReflectPad {
         let [_, h, w, _] = shape.nhwc().expect("an image");
         sink.accumulate(0, |out, accum| {
             let work = g.len();
-            parallel::for_each_chunk(out, w * c, work, |i, out| {
+            parallel::for_each_unit(out, w * c, work, |i, out| {
                 begin_sum(out, accum);
                 for row in images(i % h, top, h, bottom).into_iter().flatten() {
                     let g = &g.data()[(i / h * oh + row) * ow * c..][..ow * c];

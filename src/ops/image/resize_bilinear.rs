@@ -4,7 +4,7 @@ use crate::depth::half_pixel;
 use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::pool::Buffer;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime, simd};
 
 /// Bilinear resize of [batch, height, width, channels], each pixel interpolated between its four neighbours;
 /// no smoothing when it shrinks.
@@ -78,7 +78,7 @@ impl<T: Float> Transposed<T> {
 
 /// Rows handed to a thread at a time: about 2^14 elements.
 fn band(row: usize) -> usize {
-    ((1 << 14) / row.max(1)).max(1)
+    regime::size(((1 << 14) / row.max(1)).max(1))
 }
 
 impl<T: Float> Op<T> for ResizeBilinear {

@@ -46,7 +46,7 @@ impl<T: Float> Op<T> for UpsampleNearest {
                 return;
             }
             // One row of the input becomes `scale` rows: the first is spread, the others are its copies.
-            parallel::for_each_chunk(out, s * row, work, |i, out| {
+            parallel::for_each_unit(out, s * row, work, |i, out| {
                 let (first, copies) = out.split_at_mut(row);
                 let x = &x.data()[i * w * c..][..w * c];
                 simd::dispatch(

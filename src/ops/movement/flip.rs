@@ -15,7 +15,7 @@ pub struct Flip {
 /// `out = ` the numbers of `x` reversed along an axis, or added to what is there: the value, and the gradient too.
 fn reversed<T: Float>(out: &mut [T], accum: Accum, x: &Tensor<T>, axis: usize) {
     let [_, n, inner] = cut(x.shape(), axis, 1);
-    parallel::for_each_chunk(out, n * inner, x.len(), |i, out| {
+    parallel::for_each_unit(out, n * inner, x.len(), |i, out| {
         let x = &x.data()[i * n * inner..][..n * inner];
         for (out, x) in out.chunks_exact_mut(inner).zip(x.chunks_exact(inner).rev()) {
             put_run(accum, out, x);

@@ -40,7 +40,7 @@ impl<T: Float> Op<T> for IndexSelect {
         indices::check(Self::NAME, index, n);
         let y = Tensor::build(x.shape().with(self.axis, k), |out| {
             let work = out.len();
-            parallel::for_each_chunk(out, k * inner, work, |o, out| {
+            parallel::for_each_unit(out, k * inner, work, |o, out| {
                 let x = &x.data()[o * n * inner..][..n * inner];
                 for (row, &i) in out.chunks_exact_mut(inner).zip(index.data()) {
                     row.copy_from_slice(&x[indices::position(i) * inner..][..inner]);
@@ -56,7 +56,7 @@ impl<T: Float> Op<T> for IndexSelect {
         let ([_, n, inner], k) = (cut(&shape, self.axis, 1), index.len());
         sink.accumulate(0, |out, accum| {
             let work = g.len();
-            parallel::for_each_chunk(out, n * inner, work, |o, out| {
+            parallel::for_each_unit(out, n * inner, work, |o, out| {
                 begin_sum(out, accum);
                 let g = &g.data()[o * k * inner..][..k * inner];
                 for (row, &i) in g.chunks_exact(inner).zip(index.data()) {

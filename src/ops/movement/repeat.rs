@@ -31,7 +31,7 @@ impl<T: Float> Op<T> for Repeat {
         let (run, times) = (n * inner, self.times);
         let y = Tensor::build(x.shape().with(self.axis, n * times), |out| {
             let work = out.len();
-            parallel::for_each_chunk(out, times * run, work, |i, out| {
+            parallel::for_each_unit(out, times * run, work, |i, out| {
                 out.chunks_exact_mut(run).for_each(|out| out.copy_from_slice(&x.data()[i * run..][..run]));
             });
         });
@@ -44,7 +44,7 @@ impl<T: Float> Op<T> for Repeat {
         let [_, n, inner] = cut(&shape, self.axis, 1);
         let (run, times) = (n * inner, self.times);
         sink.accumulate(0, |out, accum| {
-            parallel::for_each_chunk(out, run, g.len(), |i, out| {
+            parallel::for_each_unit(out, run, g.len(), |i, out| {
                 begin_sum(out, accum);
                 for g in g.data()[i * times * run..][..times * run].chunks_exact(run) {
                     out.iter_mut().zip(g).for_each(|(d, &g)| *d += g);

@@ -69,7 +69,7 @@ fn fold<T: Float>(out: &mut [T], lanes: &[T]) {
 fn statistics<T: Float>(x: &[T], c: usize, tile: usize) -> (Vec<f64>, Vec<f64>) {
     let (rows, width) = (x.len() / c, width(c));
     let mut parts = Buffer::<T>::stale(rows.div_ceil(tile) * 2 * c);
-    parallel::for_each_chunk(&mut parts, 2 * c, 2 * x.len(), |i, part| {
+    parallel::for_each_unit(&mut parts, 2 * c, 2 * x.len(), |i, part| {
         let x = &x[i * tile * c..((i + 1) * tile).min(rows) * c];
         let share = T::ONE / T::of((x.len() / c) as f64);
         let (mean, squares) = part.split_at_mut(c);
@@ -225,7 +225,7 @@ fn parameter_gradients<T: Float>(
 ) -> [Vec<f64>; 2] {
     let (x, c, width) = (s.x.data(), s.x.shape().last(), lanes.width);
     let mut parts = Buffer::<T>::stale(x.len().div_ceil(chunk) * 2 * c);
-    parallel::for_each_chunk(&mut parts, 2 * c, 4 * x.len(), |i, part| {
+    parallel::for_each_unit(&mut parts, 2 * c, 4 * x.len(), |i, part| {
         let end = ((i + 1) * chunk).min(x.len());
         let (x, g) = (&x[i * chunk..end], &g[i * chunk..end]);
         let (mut plain, mut centred) = (Buffer::<T>::stale(width), Buffer::<T>::stale(width));

@@ -150,7 +150,7 @@ impl<T: Float> Op<T> for LayerNorm {
             return;
         }
         let mut parts = Buffer::<T>::stale((rows * c).div_ceil(chunk) * 2 * c);
-        parallel::for_each_chunk(&mut parts, 2 * c, 8 * x.len(), |i, part| {
+        parallel::for_each_unit(&mut parts, 2 * c, 8 * x.len(), |i, part| {
             let end = ((i + 1) * chunk).min(x.len());
             let (x, g) = (&x.data()[i * chunk..end], &g.data()[i * chunk..end]);
             let (dweight, dbias) = part.split_at_mut(c);

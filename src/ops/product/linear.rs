@@ -153,6 +153,7 @@ impl Checked for Linear {
             Case::new("tile and one", tiled(4), [x(&[5, 5]), w(5, 2), b(2)]),
             Case::new("partial sums", tiled(0), [x(&[300, 2]), w(2, 3), b(3)]),
             Case::new("partial sums without bias", tiled(0), [x(&[300, 2]), w(2, 3)]),
+            Case::new("whole panels of weights", tiled(0), [x(&[160, 2]), w(2, 48)]),
             Case::new("several register tiles", tiled(0), [x(&[25, 11]), w(11, 17), b(17)]),
             Case::new("GELU, with bias", gelu(0), [x(&[2, 3, 5]), w(5, 4), b(4)]),
             Case::new("GELU, without bias", gelu(0), [x(&[2, 3, 5]), w(5, 4)]),

@@ -36,7 +36,7 @@ impl<T: Float> Op<T> for Matmul {
         let [batch, m, k, n] = extents(a.shape(), b.shape());
         let shape = a.shape().with(a.shape().rank() - 1, n);
         let y = Tensor::build(shape, |out| {
-            parallel::for_each_chunk(out, m * n, 2 * batch * m * n * k, |i, out| {
+            parallel::for_each_unit(out, m * n, 2 * batch * m * n * k, |i, out| {
                 let a = Rows::dense(&a.data()[i * m * k..][..m * k], m, k);
                 let b = Rows::dense(&b.data()[i * k * n..][..k * n], k, n);
                 gemm(RowsMut::dense(out, m, n), crate::tensor::Accum::Replace, a, b, T::ONE);
@@ -54,7 +54,7 @@ impl<T: Float> Op<T> for Matmul {
             let k = b.dims()[r - 2];
             sink.accumulate(0, |out, accum| {
                 let work = 2 * g.len() * k;
-                parallel::for_each_chunk(out, m * k, work, |i, out| {
+                parallel::for_each_unit(out, m * k, work, |i, out| {
                     let g = Rows::dense(&g.data()[i * m * n..][..m * n], m, n);
                     let b = Rows::dense(&b.data()[i * k * n..][..k * n], k, n);
                     gemm(RowsMut::dense(out, m, k), accum, g, b.t(), T::ONE);
@@ -65,7 +65,7 @@ impl<T: Float> Op<T> for Matmul {
             let k = a.dims()[r - 1];
             sink.accumulate(1, |out, accum| {
                 let work = 2 * g.len() * k;
-                parallel::for_each_chunk(out, k * n, work, |i, out| {
+                parallel::for_each_unit(out, k * n, work, |i, out| {
                     let g = Rows::dense(&g.data()[i * m * n..][..m * n], m, n);
                     let a = Rows::dense(&a.data()[i * m * k..][..m * k], m, k);
                     gemm(RowsMut::dense(out, k, n), accum, a.t(), g, T::ONE);

@@ -90,11 +90,11 @@ const PARTS: usize = 8;
 fn sum_each<T: Float>(out: &mut [T], x: &[T], n: usize, inner: usize) {
     let (inner, work) = (inner.max(1), x.len());
     if n < regime::size(LONG) {
-        return parallel::for_each_chunk(out, inner, work, |i, out| sum_rows(out, &x[i * n * inner..][..n * inner]));
+        return parallel::for_each_unit(out, inner, work, |i, out| sum_rows(out, &x[i * n * inner..][..n * inner]));
     }
     let step = n.div_ceil(PARTS);
     let mut parts = Buffer::stale(out.len() * PARTS);
-    parallel::for_each_chunk(&mut parts, inner, work, |i, part| {
+    parallel::for_each_unit(&mut parts, inner, work, |i, part| {
         let (from, to) = ((i % PARTS * step).min(n), ((i % PARTS + 1) * step).min(n));
         sum_rows(part, &x[(i / PARTS * n + from) * inner..(i / PARTS * n + to) * inner]);
     });

@@ -9,7 +9,7 @@ pub(in crate::ops) fn sum_squares<T: Float>(out: &mut [T], accum: Accum, g: &[T]
     if g.is_empty() {
         return;
     }
-    parallel::for_each_chunk(out, w * c, g.len(), |i, out| {
+    parallel::for_each_unit(out, w * c, g.len(), |i, out| {
         let g = &g[i * s * row..][..s * row];
         simd::dispatch(
             #[inline(always)]

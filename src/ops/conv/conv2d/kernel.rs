@@ -118,7 +118,7 @@ fn turned<T: Float>(g: &Geometry, w: &[T]) -> Buffer<T> {
     let (cg, ng, taps) = (g.group_in(), g.group_out(), g.kernel[0] * g.kernel[1]);
     let mut out = Buffer::stale(w.len());
     let work = w.len();
-    parallel::for_each_chunk(&mut out, ng * g.channels, work, |tap, block| {
+    parallel::for_each_unit(&mut out, ng * g.channels, work, |tap, block| {
         let from = &w[(taps - 1 - tap) * cg * g.out_channels..][..cg * g.out_channels];
         for group in 0..g.groups {
             // Some channels at a time, which stay in the cache for all the outputs.
@@ -169,7 +169,7 @@ pub(in crate::ops) fn border_gradient<T: Float>(out: &mut [T], g: &Geometry, t: 
         .collect();
     let (patch, c, image) = (padded.patch(), g.channels, t.size[0] * t.size[1] * t.channels);
     let work = 2 * g.batch * positions.len() * patch * c;
-    parallel::for_each_chunk(out, g.size[0] * g.size[1] * c, work, |b, out| {
+    parallel::for_each_unit(out, g.size[0] * g.size[1] * c, work, |b, out| {
         let mut patches = Buffer::stale(positions.len() * patch);
         let mut sums = Buffer::stale(positions.len() * c);
         for group in 0..g.groups {
@@ -217,7 +217,7 @@ pub(in crate::ops) fn weights_of<T: Float>(g: &Geometry, first: usize, channels:
 fn scatter<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, dy: &[T], w: &[T]) {
     let (c, cg, n, ng, patch, width) = (g.channels, g.group_in(), g.out_channels, g.group_out(), g.patch(), g.out[1]);
     let work = 2 * g.rows() * width * patch * n;
-    parallel::for_each_chunk(out, g.size[0] * g.size[1] * c, work, |b, out| {
+    parallel::for_each_unit(out, g.size[0] * g.size[1] * c, work, |b, out| {
         begin_sum(out, accum);
         let tile = g.tile().min(g.out[0]).max(1);
         let mut patches = Buffer::stale(tile * width * patch);

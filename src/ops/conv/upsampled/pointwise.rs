@@ -18,7 +18,7 @@ pub(super) fn convolve<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: R
     if work == 0 {
         return;
     }
-    parallel::for_each_chunk(out, 4 * line, work, |i, out| {
+    parallel::for_each_unit(out, 4 * line, work, |i, out| {
         let products = &products.data()[i * line..][..line];
         simd::dispatch(
             #[inline(always)]

@@ -110,7 +110,7 @@ fn turned<T: Float>(g: &Geometry, w: &[T]) -> Buffer<T> {
     // Row a of the 4x4 window is row 2y + a - 1 of the output, which sees row y with rows 2 - a and 3 - a of its
     // window.
     let seen = |a: usize| (2usize.saturating_sub(a)..=3 - a).filter(move |k| *k < 3 && *k + a >= 2);
-    parallel::for_each_chunk(&mut out, n * c, 4 * w.len(), |at, out| {
+    parallel::for_each_unit(&mut out, n * c, 4 * w.len(), |at, out| {
         for ky in seen(at / 4) {
             for kx in seen(at % 4) {
                 let w = &w[(3 * ky + kx) * c * n..][..c * n];
