@@ -11,7 +11,7 @@ use parallax::formats::atomic::check_writable;
 use parallax::formats::picture::{check_picture, read_picture};
 use parallax::formats::png::write_png;
 use parallax::report::overlay::{Overlay, mark};
-use parallax::tensor::Tensor;
+use parallax::tensor::{Tensor, profile};
 use parallax::train::run::load_weights;
 use parallax::{Error, Result};
 use serde::Serialize;
@@ -116,6 +116,10 @@ pub fn run(args: Args) -> Result<()> {
     let scaled = |at: u32, from: u32, to: usize| ((f64::from(at) + 0.5) * to as f64 / f64::from(from)) as usize;
     let pixel = [scaled(y, h, height), scaled(x, w, width)];
     let found = attention(&model, &params, &seen, pixel);
+    if !found.disparities.iter().all(Tensor::is_finite) {
+        let culprit = profile::first_not_finite(|| attention(&model, &params, &seen, pixel)).unwrap_or_default();
+        return Err(Error::file(&args.weights, format!("its disparities are not finite: {culprit}")));
+    }
     let saliency = saliency(&model, &params, &seen, pixel, args.radius.into());
 
     let stem = args.image.file_stem().unwrap_or(args.image.as_os_str()).to_string_lossy().into_owned();

@@ -228,10 +228,10 @@ fn predict(args: &Args, predictor: &Predictor, job: Job, (height, width): (usize
     let picture = read_picture(&job.input.path)?;
     let (w, h) = (picture.width() as usize, picture.height() as usize);
     let camera = args.camera(w as f64, h as f64);
-    let map = predictor.inverse_depth(&lanczos(&picture, width as u32, height as u32), args.flip);
+    let seen = lanczos(&picture, width as u32, height as u32);
+    let map = predictor.inverse_depth(&seen, args.flip);
     if !map.is_whole() {
-        let message = "the network's depth of it is not finite: the weights are broken";
-        return Err(Error::file(&job.input.path, message));
+        return Err(Error::file(&job.input.path, predictor.why_not_finite(&seen)));
     }
     let factor = args.factor(&job.input, &map.values, (height, width), camera)?;
     let median_depth = median(map.values.iter().map(|&d| factor / f64::from(d)).collect()).unwrap_or(f64::NAN);

@@ -12,6 +12,7 @@ use crate::depth::{Disparity, InverseDepth};
 use crate::error::{Error, Result};
 use crate::monovit::{MonoVit, Setup};
 use crate::nn::{Folded, Params};
+use crate::tensor::profile;
 use crate::weights::{self, Need, Weights};
 use image::RgbImage;
 
@@ -86,7 +87,7 @@ impl Predictor {
         let disparity = self.disparity(&seen);
         let inverse_depth = disparity.inverse_depth(self.setup.min_depth, self.setup.max_depth);
         if !inverse_depth.is_whole() {
-            return Err(Error::Failed("the networks' depth is not finite: the weights are broken".into()));
+            return Err(Error::Failed(self.why_not_finite(&seen)));
         }
         let inverse_depth = inverse_depth.resized(height as usize, width as usize, 1.0);
         Ok(Prediction { disparity, inverse_depth })
@@ -95,6 +96,14 @@ impl Predictor {
     /// Sigmoid disparity of a picture whose sides are multiples of 32.
     pub fn disparity(&self, image: &RgbImage) -> Disparity {
         self.disparities(&[image]).swap_remove(0)
+    }
+
+    /// Why the depth of a picture whose sides are multiples of 32 is no depth: the op that first made a number that is not
+    /// finite.
+    pub fn why_not_finite(&self, image: &RgbImage) -> String {
+        let culprit = profile::first_not_finite(|| self.disparity(image));
+        let culprit = culprit.unwrap_or_else(|| "a disparity is beyond its range".into());
+        format!("the networks' depth is not finite: the weights are broken; {culprit}")
     }
 
     fn disparities(&self, images: &[&RgbImage]) -> Vec<Disparity> {
@@ -133,6 +142,9 @@ pub fn evaluate(
     compare(data, samples, how, seen, |sample| {
         let image = data.image(sample, 0)?;
         let found = predictor.inverse_depth(&image, how.flip);
+        if !found.is_whole() {
+            return Err(Error::Failed(format!("{}: {}", data.name(sample), predictor.why_not_finite(&image))));
+        }
         let size = found.size();
         Ok((found.values, size))
     })
@@ -190,4 +202,27 @@ fn compare(
         return Err(Error::Failed(message));
     }
     Ok(Report { without_depth, ..Report::new(results)? })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::monovit::Preset;
+    use crate::tensor::Tensor;
+
+    #[test]
+    fn weights_that_overflow_are_named_by_the_op_that_did() {
+        let setup = Setup { height: 64, width: 96, ..Setup::of(Preset::Pico) };
+        let (model, mut params) = MonoVit::new::<f32>(setup.model(), 0);
+        let picture = RgbImage::from_fn(96, 64, |x, y| image::Rgb([x as u8, y as u8, 90]));
+        assert!(Predictor::new(&model, &params, &setup).depth_of(&picture).is_ok());
+        let (id, huge) = params
+            .iter()
+            .find(|(_, p)| p.name() == "encoder.stem.1.conv.weight")
+            .map(|(id, p)| (id, Tensor::full(*p.value.shape(), 3e38)))
+            .expect("a weight");
+        params.set(id, huge);
+        let error = Predictor::new(&model, &params, &setup).depth_of(&picture).unwrap_err().to_string();
+        assert!(error.contains("the first op that made such a number is conv2d ["), "{error}");
+    }
 }

@@ -89,6 +89,16 @@ pub fn record<R>(look_for_nan: bool, f: impl FnOnce() -> R) -> (R, Vec<Entry>) {
     (result, profile.ops)
 }
 
+/// Runs `f` and says which op first made a number that is not finite, if one did: its name, kernel path, place and shape.
+pub fn first_not_finite<R>(f: impl FnOnce() -> R) -> Option<String> {
+    let (_, entries) = record(true, f);
+    let (i, e) = entries.iter().enumerate().find(|(_, e)| !e.finite)?;
+    Some(format!(
+        "the first op that made such a number is {} [{}], op {i} of the forward pass, output {}",
+        e.op, e.algo, e.output
+    ))
+}
+
 /// Runs `f` and returns all that ran on this thread meanwhile, with the time it took.
 pub fn profile<R>(f: impl FnOnce() -> R) -> (R, Profile) {
     listen(false, f)

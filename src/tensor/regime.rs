@@ -65,7 +65,7 @@ pub(crate) fn note(place: &'static Location<'static>, pieces: usize, rest: Optio
 #[track_caller]
 pub fn blocks(range: Range<usize>, usual: usize) -> impl Iterator<Item = Range<usize>> {
     let block = size(usual).max(1);
-    note(Location::caller(), range.len().div_ceil(block), Some(range.len() % block != 0));
+    note(Location::caller(), range.len().div_ceil(block), Some(!range.len().is_multiple_of(block)));
     range.clone().step_by(block).map(move |first| first..(first + block).min(range.end))
 }
 

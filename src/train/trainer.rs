@@ -190,13 +190,11 @@ impl Trainer {
 
     /// Runs the forward pass once more, looking at every number.
     fn explain(&self, step: u64, batch: &Batch) -> Error {
-        let (_, entries) = profile::record(true, || self.forward(&Tape::new(), batch));
-        let culprit = entries.iter().enumerate().find(|(_, e)| !e.finite);
+        let culprit = profile::first_not_finite(|| self.forward(&Tape::new(), batch));
         Error::Failed(match culprit {
-            Some((i, e)) => format!(
-                "step {step}: the loss is not finite; the first op that made such a number is {} [{}], op {i} of the \
-                 forward pass, output {}. The last good checkpoint is kept: try a smaller learning rate",
-                e.op, e.algo, e.output
+            Some(culprit) => format!(
+                "step {step}: the loss is not finite; {culprit}. The last good checkpoint is kept: try a smaller learning \
+                 rate"
             ),
             None => format!("step {step}: the loss is not finite, and was so only once: a hardware fault?"),
         })

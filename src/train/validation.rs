@@ -14,6 +14,7 @@ use crate::eval::predictor::{Evaluation, Predictor, evaluate, evaluate_mean_map}
 use crate::formats::atomic::write_bytes_atomically;
 use crate::formats::png::write_png;
 use crate::report::colormap::disparity_to_image;
+use crate::tensor::profile;
 
 /// `metrics.json`: what is known of it.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -112,7 +113,9 @@ impl Run {
             let weights = self.trainer.weights();
             let [photometric, warped, unwarped] = self.trainer.validate(&weights, batches);
             if !photometric.is_finite() {
-                let message = format!("step {step}: the photometric error on validation data is not finite");
+                let culprit = profile::first_not_finite(|| self.trainer.validate(&weights, batches));
+                let culprit = culprit.map_or_else(String::new, |culprit| format!("; {culprit}"));
+                let message = format!("step {step}: the photometric error on validation data is not finite{culprit}");
                 tell(Event::Warning(&message));
             }
             // A number that is none is never the best.

@@ -9,9 +9,9 @@ use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, poo
 /// Guards the division by the mean disparity, as published.
 const EPSILON: f64 = 1e-7;
 
-/// Edge-aware smoothness. With `D = disparity / (mean over h, w + 1e-7)`: the mean of `|D_x+1 - D_x| exp(-mean_c |I_x+1
-/// - I_x|)`, plus the same in y. Disparity `[batch, height, width, 1]`, image `[batch, height, width, channels]`, to a
-/// scalar.
+/// Edge-aware smoothness. With `D = disparity / (mean over h, w + 1e-7)`: the mean of
+/// `|D_x+1 - D_x| exp(-mean_c |I_x+1 - I_x|)`, plus the same in y. Disparity `[batch, height, width, 1]`, image `[batch,
+/// height, width, channels]`, to a scalar.
 ///
 /// The derivative of |0| is 0, in the disparity and in the image.
 #[derive(Clone, Copy, Debug)]
