@@ -60,6 +60,8 @@ pub trait Float:
     fn mul_add(self, a: Self, b: Self) -> Self;
     /// e to this power. In `f32` a branch-free polynomial that vectorises, within 2 units in the last place.
     fn exp(self) -> Self;
+    /// e to this power, less 1, exact where `self` is small. In `f32` branch-free, so that it vectorises.
+    fn exp_m1(self) -> Self;
     /// The natural logarithm.
     fn ln(self) -> Self;
     /// ln(1 + self), exact where `self` is small.
@@ -114,6 +116,33 @@ pub trait Float:
     }
 }
 
+/// x = n ln 2 + r with |r| <= ln 2 / 2, so that e^x = 2^n e^r; and p with e^r = 1 + r p, by a polynomial.
+#[inline(always)]
+fn reduced(x: f32) -> (i32, f32, f32) {
+    // Adding 1.5 * 2^23 leaves the nearest whole number in the low bits of the mantissa.
+    const MAGIC: f32 = 12_582_912.0;
+    // Beyond these e^x is 0 or infinite anyway; NaN passes through both comparisons.
+    let x = if x > 89.0 { 89.0 } else { x };
+    let x = if x < -104.0 { -104.0 } else { x };
+    let shifted = x.mul_add(std::f32::consts::LOG2_E, MAGIC);
+    let n = shifted - MAGIC;
+    // ln 2 in two parts, the first with few enough bits that n times it is exact.
+    let r = n.mul_add(-0.693_359_4, x);
+    let r = n.mul_add(2.121_944_4e-4, r);
+    let p = r.mul_add(1.0 / 720.0, 1.0 / 120.0);
+    let p = p.mul_add(r, 1.0 / 24.0);
+    let p = p.mul_add(r, 1.0 / 6.0);
+    let p = p.mul_add(r, 0.5);
+    let p = p.mul_add(r, 1.0);
+    (shifted.to_bits().wrapping_sub(MAGIC.to_bits()) as i32, r, p)
+}
+
+/// 2^k for k from -126 to 127; infinite for 128.
+#[inline(always)]
+fn power_of_2(k: i32) -> f32 {
+    f32::from_bits((k.wrapping_add(127) as u32) << 23)
+}
+
 impl Float for f32 {
     const ZERO: f32 = 0.0;
     const ONE: f32 = 1.0;
@@ -134,31 +163,28 @@ impl Float for f32 {
         f32::mul_add(self, a, b)
     }
 
-    /// x = n ln 2 + r with |r| <= ln 2 / 2, so that e^x = 2^n e^r, and e^r by a polynomial of degree 6.
-    ///
-    /// 2^n is applied in two halves, which lets the result fall into the subnormals and to 0 by itself.
+    /// e^x = 2^n (1 + q), see [`reduced`]. 2^n is applied in two halves, which lets the result fall into the subnormals and
+    /// to 0 by itself.
     #[inline(always)]
     fn exp(self) -> f32 {
-        // Adding 1.5 * 2^23 leaves the nearest whole number in the low bits of the mantissa.
-        const MAGIC: f32 = 12_582_912.0;
-        // Beyond these the result is 0 or infinite anyway; NaN passes through both comparisons.
-        let x = if self > 89.0 { 89.0 } else { self };
-        let x = if x < -104.0 { -104.0 } else { x };
-        let shifted = x.mul_add(std::f32::consts::LOG2_E, MAGIC);
-        let n = shifted - MAGIC;
-        // ln 2 in two parts, the first with few enough bits that n times it is exact.
-        let r = n.mul_add(-0.693_359_4, x);
-        let r = n.mul_add(2.121_944_4e-4, r);
-        let p = r.mul_add(1.0 / 720.0, 1.0 / 120.0);
-        let p = p.mul_add(r, 1.0 / 24.0);
-        let p = p.mul_add(r, 1.0 / 6.0);
-        let p = p.mul_add(r, 0.5);
+        let (n, r, p) = reduced(self);
         let p = p.mul_add(r, 1.0);
-        let p = p.mul_add(r, 1.0);
-        let n = shifted.to_bits().wrapping_sub(MAGIC.to_bits()) as i32;
         let half = n >> 1;
-        let scale = |k: i32| f32::from_bits((k.wrapping_add(127) as u32) << 23);
-        p * scale(half) * scale(n.wrapping_sub(half))
+        p * power_of_2(half) * power_of_2(n.wrapping_sub(half))
+    }
+    /// With e^x = 2^n (1 + q) and n = h + k: 2^h (2^k q + (2^k - 2^-h)), where nothing overflows before the result does, and
+    /// n = 0 leaves q alone.
+    #[inline(always)]
+    fn exp_m1(self) -> f32 {
+        // From here on down it is -1.
+        let x = if self < -20.0 { -20.0 } else { self };
+        let (n, r, p) = reduced(x);
+        let h = n >> 1;
+        let k = n.wrapping_sub(h);
+        let rest = power_of_2(k) - power_of_2(h.wrapping_neg());
+        let m = (p * r).mul_add(power_of_2(k), rest) * power_of_2(h);
+        // The sign of 0.
+        if self == 0.0 { self } else { m }
     }
     #[inline(always)]
     fn ln(self) -> f32 {
@@ -263,6 +289,10 @@ impl Float for f64 {
     #[inline(always)]
     fn exp(self) -> f64 {
         f64::exp(self)
+    }
+    #[inline(always)]
+    fn exp_m1(self) -> f64 {
+        f64::exp_m1(self)
     }
     #[inline(always)]
     fn ln(self) -> f64 {

