@@ -47,7 +47,7 @@ fn functions() -> Vec<Function> {
         slope_absolute,
     };
     vec![
-        f("relu", |x| x.relu(), |x| x.max(0.0), |x| f64::from(x > 0.0), 0.0, 0.0, 0.0),
+        f("relu", |x| x.relu(), |x| if x < 0.0 { 0.0 } else { x }, |x| f64::from(x > 0.0), 0.0, 0.0, 0.0),
         f(
             "elu",
             |x| x.elu(),

@@ -1,10 +1,11 @@
 //! One forward pass: the parameters as variables, what is recorded, and the statistics that move.
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
+use std::sync::Arc;
 
 use super::Folded;
-use super::params::{ParamId, Params};
+use super::params::{Identity, ParamId, Params};
 use crate::random::{Random, Stream};
 use crate::tensor::{Float, Gradients, Tape, Tensor, Var, profile};
 
@@ -20,8 +21,13 @@ enum Mode {
 }
 
 /// What a module needs besides its input.
+///
+/// A training step ends with [`into_moved`](Context::into_moved), which gives the running statistics that it moved: a
+/// context that gave its gradients and is dropped with statistics in it panics, because a model whose statistics stay
+/// behind its weights trains well and predicts badly.
 pub struct Context<T: Float> {
     vars: Vec<Var<T>>,
+    identities: Arc<Vec<Identity>>,
     mode: Mode,
     /// Running statistics that this pass has moved; later uses in the same pass go on from here.
     moved: RefCell<HashMap<ParamId, Tensor<T>>>,
@@ -29,6 +35,8 @@ pub struct Context<T: Float> {
     random: RefCell<Random>,
     /// What modules showed, by name; `None` if nobody looks.
     seen: Option<RefCell<HashMap<String, Tensor<T>>>>,
+    /// Whether gradients were taken, so that this is a training step.
+    differentiated: Cell<bool>,
 }
 
 impl<T: Float> Context<T> {
@@ -36,7 +44,7 @@ impl<T: Float> Context<T> {
     pub fn training(params: &Params<T>, tape: &Tape<T>, random: Random) -> Self {
         let var = |p: &super::Param<T>| if p.learnt { tape.leaf(p.value.clone()) } else { p.value.clone().into() };
         let vars = profile::phase("parameters to leaves", || params.iter().map(|(_, p)| var(p)).collect());
-        Self::with(vars, Mode::Training, random)
+        Self::with(params, vars, Mode::Training, random)
     }
 
     /// Inference: nothing is recorded, normalisation uses running statistics.
@@ -53,16 +61,19 @@ impl<T: Float> Context<T> {
     fn constant(params: &Params<T>, mode: Mode) -> Self {
         let vars =
             profile::phase("parameters to leaves", || params.iter().map(|(_, p)| p.value.clone().into()).collect());
-        Self::with(vars, mode, Random::of(0, Stream::Only))
+        Self::with(params, vars, mode, Random::of(0, Stream::Only))
     }
 
-    fn with(vars: Vec<Var<T>>, mode: Mode, random: Random) -> Self {
-        Context { vars, mode, moved: RefCell::default(), random: RefCell::new(random), seen: None }
+    fn with(params: &Params<T>, vars: Vec<Var<T>>, mode: Mode, random: Random) -> Self {
+        let identities = params.identities();
+        let (moved, random) = (RefCell::default(), RefCell::new(random));
+        Context { vars, identities, mode, moved, random, seen: None, differentiated: Cell::new(false) }
     }
 
     /// The same pass, looked at: what modules [`observe`](Context::observe) is kept.
-    pub fn observed(self) -> Self {
-        Context { seen: Some(RefCell::default()), ..self }
+    pub fn observed(mut self) -> Self {
+        self.seen = Some(RefCell::default());
+        self
     }
 
     /// Shows an intermediate value to whoever looks, under the path of its module. Nothing happens if nobody does.
@@ -78,8 +89,13 @@ impl<T: Float> Context<T> {
     }
 
     /// A parameter as a variable.
+    ///
+    /// # Panics
+    /// If the parameters of this pass are those of another model than the module's: names both parameters.
+    #[track_caller]
     pub fn var(&self, id: ParamId) -> &Var<T> {
-        &self.vars[id.0]
+        id.check(self.identities.get(id.index()));
+        &self.vars[id.index()]
     }
 
     /// Whether this is training.
@@ -94,7 +110,7 @@ impl<T: Float> Context<T> {
 
     /// A running statistic as this pass has left it.
     pub fn running(&self, id: ParamId) -> Tensor<T> {
-        self.moved.borrow().get(&id).cloned().unwrap_or_else(|| self.vars[id.0].value().clone())
+        self.moved.borrow().get(&id).cloned().unwrap_or_else(|| self.var(id).value().clone())
     }
 
     /// Moves a running statistic: `(1 - momentum) old + momentum new`.
@@ -121,11 +137,78 @@ impl<T: Float> Context<T> {
 
     /// Ends the pass: the running statistics it moved.
     pub fn into_moved(self) -> HashMap<ParamId, Tensor<T>> {
-        self.moved.into_inner()
+        std::mem::take(&mut *self.moved.borrow_mut())
     }
 
     /// The gradient of every parameter that the output depends on.
     pub fn gradients(&self, gradients: &mut Gradients<T>) -> Vec<Option<Tensor<T>>> {
+        self.differentiated.set(true);
         profile::phase("leaves to gradients", || self.vars.iter().map(|v| gradients.take(v)).collect())
+    }
+}
+
+impl<T: Float> Drop for Context<T> {
+    fn drop(&mut self) {
+        let left = self.differentiated.get() && !self.moved.borrow().is_empty();
+        if left && !std::thread::panicking() {
+            panic!(
+                "a training step moved running statistics that were not put back: after `gradients`, give each value of \
+                 `into_moved` to `Params::set` (or drop what `into_moved` returns, to leave them as they were)"
+            );
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::nn::{Builder, Init, Linear};
+
+    /// A model of one layer.
+    fn model(name: &str, inputs: usize) -> (Linear, Params<f64>) {
+        let (mut params, mut random) = (Params::new(), Random::of(1, Stream::Only));
+        let b = &mut Builder::new(&mut params, &mut random);
+        let layer = Linear::new(&mut b.at(name), [inputs, 2], Init::Constant(1.0), true);
+        (layer, params)
+    }
+
+    #[test]
+    fn a_module_with_another_models_parameters_is_refused_with_both_names() {
+        let ((encoder, own), (_, others)) = (model("encoder", 3), model("decoder", 3));
+        let x = Var::constant(Tensor::zeros([1, 3]));
+        encoder.forward(&Context::inference(&own), &x);
+        // The same model with other numbers is the same model.
+        let (_, averaged) = model("encoder", 3);
+        encoder.forward(&Context::inference(&averaged), &x);
+        let refused = |params: &Params<f64>| {
+            let run = std::panic::AssertUnwindSafe(|| encoder.forward(&Context::inference(params), &x));
+            let message = std::panic::catch_unwind(run).err().expect("refused");
+            message.downcast_ref::<String>().cloned().unwrap_or_default()
+        };
+        let message = refused(&others);
+        assert!(message.contains("encoder.weight") && message.contains("decoder.weight"), "{message}");
+        let message = refused(&model("encoder", 5).1);
+        assert!(message.contains("[3, 2]") && message.contains("[5, 2]"), "{message}");
+        assert!(refused(&Params::new()).contains("nothing"));
+    }
+
+    #[test]
+    fn statistics_that_are_not_put_back_are_loud() {
+        use crate::nn::BatchNorm;
+        let (mut params, mut random) = (Params::<f64>::new(), Random::of(1, Stream::Only));
+        let norm =
+            BatchNorm::new(&mut Builder::new(&mut params, &mut random).at("bn"), 2, crate::ops::Activation::None);
+        let step = |put_back: bool| {
+            let tape = Tape::new();
+            let c = Context::training(&params, &tape, Random::of(1, Stream::Only));
+            let y = norm.forward(&c, &Var::constant(Tensor::from_vec([2, 2], vec![1.0, 2.0, 3.0, 5.0])));
+            c.gradients(&mut y.sum_all().backward());
+            if put_back {
+                assert_eq!(c.into_moved().len(), 2);
+            }
+        };
+        step(true);
+        let message = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| step(false))).err().expect("loud");
+        assert!(message.downcast_ref::<&str>().is_some_and(|m| m.contains("were not put back")));
     }
 }

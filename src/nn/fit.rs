@@ -145,7 +145,7 @@ pub fn fit<T: Float>(params: &Params<T>, tensors: &[Named]) -> Result<Fit<T>> {
     let mut candidates: Vec<Vec<&Named>> = vec![Vec::new(); params.len()];
     for tensor in tensors {
         match params.find(&tensor.name) {
-            Some(id) => candidates[id.0].push(tensor),
+            Some(id) => candidates[id.index()].push(tensor),
             None => report.unexpected.push(shown(&tensor.origin)),
         }
     }

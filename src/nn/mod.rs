@@ -21,3 +21,4 @@ pub use init::{Init, Start};
 pub use linear::Linear;
 pub use norm::{BatchNorm, LayerNorm};
 pub use params::{Builder, Layout, Param, ParamId, Params};
+pub(crate) use params::{Identity, same_model};

@@ -56,10 +56,12 @@ impl BatchNorm {
 pub struct LayerNorm {
     weight: ParamId,
     bias: ParamId,
+    eps: f64,
 }
 
 impl LayerNorm {
-    /// Added to the variance under the root.
+    /// What is added to the variance under the root, unless said otherwise: that of vision transformers. PyTorch's own
+    /// default is 1e-5.
     pub const EPS: f64 = 1e-6;
 
     /// The parameters stand directly under the builder's path.
@@ -67,12 +69,39 @@ impl LayerNorm {
         LayerNorm {
             weight: b.param("weight", [channels], Layout::Same, Init::Constant(1.0)),
             bias: b.param("bias", [channels], Layout::Same, Init::Constant(0.0)),
+            eps: Self::EPS,
         }
+    }
+
+    /// This normalisation with another number added to the variance.
+    pub fn with_eps(self, eps: f64) -> Self {
+        LayerNorm { eps, ..self }
     }
 
     /// `[.., C] -> [.., C]`.
     #[track_caller]
     pub fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
-        x.layer_norm(c.var(self.weight), c.var(self.bias), Self::EPS)
+        x.layer_norm(c.var(self.weight), c.var(self.bias), self.eps)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::nn::Params;
+    use crate::random::{Random, Stream};
+
+    /// With variances near eps the choice shows: (x - 2e-3) / sqrt(1e-6 + eps).
+    #[test]
+    fn layer_norm_takes_the_eps_of_the_network_it_belongs_to() {
+        let (mut params, mut random) = (Params::<f64>::new(), Random::of(0, Stream::Only));
+        let norm = LayerNorm::new(&mut Builder::new(&mut params, &mut random), 2);
+        let c = Context::inference(&params);
+        let x = Var::constant(Tensor::from_vec([1, 2], vec![1e-3, 3e-3]));
+        for (norm, eps) in [(norm.clone(), 1e-6), (norm.with_eps(1e-5), 1e-5)] {
+            let expected = 1e-3 / (1e-6f64 + eps).sqrt();
+            let y = norm.forward(&c, &x).into_value();
+            assert!((y.data()[1] - expected).abs() < 1e-9, "{y:?} for {eps}");
+        }
     }
 }

@@ -1,15 +1,83 @@
 //! Parameters and buffers by path, with the names, shapes and layouts of the public checkpoints.
 
 use std::collections::{BTreeMap, HashMap};
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use super::BatchNorm;
 use super::init::{Init, Start};
 use crate::random::Random;
 use crate::tensor::{Float, Shape, Tensor};
 
-/// Which parameter: an index into [`Params`].
+/// Which parameter: an index into [`Params`], and what stands there.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct ParamId(pub(crate) usize);
+pub struct ParamId {
+    index: usize,
+    identity: Identity,
+}
+
+impl ParamId {
+    /// The index.
+    pub(crate) fn index(self) -> usize {
+        self.index
+    }
+
+    /// Makes sure that what stands in some parameters at this index is what this stands for.
+    ///
+    /// # Panics
+    /// If it is another one: names both.
+    #[inline]
+    #[track_caller]
+    pub(crate) fn check(self, there: Option<&Identity>) {
+        if there != Some(&self.identity) {
+            let there = there.map_or_else(|| "nothing".to_owned(), |other| other.name());
+            panic!(
+                "{} is looked for in the parameters of another model, which have {there} in its place: use a module with \
+                 the parameters that its builder made, or with those of the same model",
+                self.identity.name()
+            );
+        }
+    }
+}
+
+/// What a parameter is: its name and shape. Modules keep no numbers, so that one can be used with several sets of
+/// parameters (trained ones, averaged ones); they only have to be of the same model.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(crate) struct Identity(u64);
+
+/// The names behind identities, for messages: one entry for each name and shape that this process has seen.
+static IDENTITIES: Mutex<BTreeMap<u64, String>> = Mutex::new(BTreeMap::new());
+
+impl Identity {
+    fn of(name: &str, shape: &Shape) -> Self {
+        let mut hasher = DefaultHasher::new();
+        (name, shape.dims()).hash(&mut hasher);
+        let identity = hasher.finish();
+        let mut known = IDENTITIES.lock().unwrap_or_else(PoisonError::into_inner);
+        known.entry(identity).or_insert_with(|| format!("{name} {shape}"));
+        Identity(identity)
+    }
+
+    /// Name and shape.
+    pub(crate) fn name(self) -> String {
+        let known = IDENTITIES.lock().unwrap_or_else(PoisonError::into_inner);
+        known.get(&self.0).cloned().unwrap_or_default()
+    }
+}
+
+/// Makes sure that `who` is used with the parameters of the model that it was made for.
+///
+/// # Panics
+/// If not: names the first parameter that differs.
+#[track_caller]
+pub(crate) fn same_model(who: &str, made_for: &[Identity], given: &[Identity]) {
+    if made_for == given {
+        return;
+    }
+    let at = made_for.iter().zip(given).position(|(a, b)| a != b).unwrap_or(made_for.len().min(given.len()));
+    let name = |of: &[Identity]| of.get(at).map_or_else(|| "nothing".to_owned(), |identity| identity.name());
+    panic!("{who} was made for other parameters: number {at} was {}, and is {} here", name(made_for), name(given));
+}
 
 /// How a tensor lies in a PyTorch checkpoint, beside how it lies here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -81,6 +149,7 @@ impl<T: Float> Param<T> {
 #[derive(Clone, Debug, Default)]
 pub struct Params<T: Float> {
     all: Vec<Param<T>>,
+    identities: Arc<Vec<Identity>>,
     by_name: HashMap<String, ParamId>,
     /// The convolutions with a normalisation directly behind them.
     pub(super) normalised: Vec<(ParamId, BatchNorm)>,
@@ -89,12 +158,13 @@ pub struct Params<T: Float> {
 impl<T: Float> Params<T> {
     /// No tensors.
     pub fn new() -> Self {
-        Params { all: Vec::new(), by_name: HashMap::new(), normalised: Vec::new() }
+        Params { all: Vec::new(), identities: Arc::default(), by_name: HashMap::new(), normalised: Vec::new() }
     }
 
     /// Every tensor, in the order in which modules asked for them.
     pub fn iter(&self) -> impl ExactSizeIterator<Item = (ParamId, &Param<T>)> {
-        self.all.iter().enumerate().map(|(i, p)| (ParamId(i), p))
+        let of = |(index, param)| (ParamId { index, identity: self.identities[index] }, param);
+        self.all.iter().enumerate().map(of)
     }
 
     /// How many there are.
@@ -109,12 +179,24 @@ impl<T: Float> Params<T> {
 
     /// One of them.
     pub fn get(&self, id: ParamId) -> &Param<T> {
-        &self.all[id.0]
+        self.check(id);
+        &self.all[id.index]
+    }
+
+    /// What the parameters are, in their order.
+    pub(crate) fn identities(&self) -> Arc<Vec<Identity>> {
+        self.identities.clone()
+    }
+
+    #[track_caller]
+    fn check(&self, id: ParamId) {
+        id.check(self.identities.get(id.index));
     }
 
     /// The numbers of one of them, to be changed.
     pub fn value_mut(&mut self, id: ParamId) -> &mut Tensor<T> {
-        &mut self.all[id.0].value
+        self.check(id);
+        &mut self.all[id.index].value
     }
 
     /// Replaces the numbers of one of them.
@@ -123,7 +205,8 @@ impl<T: Float> Params<T> {
     /// If the shape differs.
     #[track_caller]
     pub fn set(&mut self, id: ParamId, value: Tensor<T>) {
-        let param = &mut self.all[id.0];
+        self.check(id);
+        let param = &mut self.all[id.index];
         assert_eq!(param.value.shape(), value.shape(), "{}", param.name());
         param.value = value;
     }
@@ -151,12 +234,19 @@ impl<T: Float> Params<T> {
             layout: p.layout,
             learnt: p.learnt,
         });
-        Params { all: all.collect(), by_name: self.by_name.clone(), normalised: self.normalised.clone() }
+        Params {
+            all: all.collect(),
+            identities: self.identities.clone(),
+            by_name: self.by_name.clone(),
+            normalised: self.normalised.clone(),
+        }
     }
 
     #[track_caller]
     fn add(&mut self, param: Param<T>) -> ParamId {
-        let id = ParamId(self.all.len());
+        let identity = Identity::of(param.name(), param.value.shape());
+        let id = ParamId { index: self.all.len(), identity };
+        Arc::make_mut(&mut self.identities).push(identity);
         let before = self.by_name.insert(param.name().to_owned(), id);
         assert!(before.is_none(), "two parameters are called {}", param.name());
         self.all.push(param);
@@ -167,7 +257,7 @@ impl<T: Float> Params<T> {
     fn alias(&mut self, id: ParamId, name: String) {
         let before = self.by_name.insert(name.clone(), id);
         assert!(before.is_none(), "two parameters are called {name}");
-        self.all[id.0].names.push(name);
+        self.all[id.index].names.push(name);
     }
 }
 

@@ -1,6 +1,8 @@
 //! AdamW (Loshchilov and Hutter, 1711.05101): Adam with decoupled weight decay.
 
-use crate::nn::Params;
+use std::sync::Arc;
+
+use crate::nn::{Identity, Params, same_model};
 use crate::tensor::{Float, Tensor, parallel, regime, simd};
 
 /// The settings of a group of parameters.
@@ -28,19 +30,29 @@ pub struct AdamW<T: Float> {
     pub moments: Vec<Option<[Tensor<T>; 2]>>,
     /// Steps taken.
     pub steps: u64,
+    /// The parameters that it was made for.
+    identities: Arc<Vec<Identity>>,
 }
 
 impl<T: Float> AdamW<T> {
     /// No steps taken, betas 0.9 and 0.999, eps 1e-8.
     pub fn new(params: &Params<T>) -> Self {
-        AdamW { betas: [0.9, 0.999], eps: 1e-8, moments: vec![None; params.len()], steps: 0 }
+        AdamW {
+            betas: [0.9, 0.999],
+            eps: 1e-8,
+            moments: vec![None; params.len()],
+            steps: 0,
+            identities: params.identities(),
+        }
     }
 
     /// One step. `gradients` are in the order of the parameters; `group` gives each parameter's settings by its name.
     ///
     /// # Panics
-    /// If a gradient has another shape than its parameter.
+    /// If the parameters are not those of the model that it was made for: names the first that differs. If a gradient has
+    /// another shape than its parameter.
     pub fn step(&mut self, params: &mut Params<T>, gradients: &[Option<Tensor<T>>], group: impl Fn(&str) -> Group) {
+        same_model("AdamW", &self.identities, &params.identities());
         self.steps += 1;
         let [b1, b2] = self.betas;
         let correct = |b: f64| 1.0 - b.powi(self.steps.min(i32::MAX as u64) as i32);

@@ -1,6 +1,8 @@
 //! An exponential moving average of the weights: smoother than the last step, and often better.
 
-use crate::nn::Params;
+use std::sync::Arc;
+
+use crate::nn::{Identity, Params, same_model};
 use crate::tensor::{Float, Tensor, parallel, regime, simd};
 
 /// Elements handed to a thread at a time.
@@ -14,16 +16,23 @@ pub struct Average<T: Float> {
     pub decay: f64,
     /// The averages, in the order of the parameters.
     pub values: Vec<Tensor<T>>,
+    /// The parameters that it was made for.
+    identities: Arc<Vec<Identity>>,
 }
 
 impl<T: Float> Average<T> {
     /// Starts at the weights as they are.
     pub fn new(params: &Params<T>, decay: f64) -> Self {
-        Average { decay, values: params.iter().map(|(_, p)| p.value.clone()).collect() }
+        let values = params.iter().map(|(_, p)| p.value.clone()).collect();
+        Average { decay, values, identities: params.identities() }
     }
 
     /// Takes in the weights after step `t`.
+    ///
+    /// # Panics
+    /// If they are not those of the model that it was made for.
     pub fn update(&mut self, params: &Params<T>, t: u64) {
+        same_model("the average", &self.identities, &params.identities());
         let decay = self.decay.min((1.0 + t as f64) / (10.0 + t as f64));
         let take = T::of(1.0 - decay);
         for (average, (_, p)) in self.values.iter_mut().zip(params.iter()) {

