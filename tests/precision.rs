@@ -201,3 +201,70 @@ fn functions_of_one_number_keep_their_promise_over_all_of_f32() {
     }
     assert!(failures.is_empty(), "{}", failures.join("\n"));
 }
+
+/// A row or a channel of numbers whose squares, and even whose sum, overflow f32; and one whose mean is far from 0.
+#[test]
+fn normalisations_hold_for_any_finite_numbers() {
+    let constant = |shape: &[usize], x: Vec<f32>| Var::constant(Tensor::from_vec(shape, x));
+    let shape = |n: usize, x: &[f32]| (n, x.to_vec());
+    let cases = [
+        (shape(4, &[1e20, -1e20, 2e20, -2e20]), [0.632_455_5, -0.632_455_5, 1.264_911, -1.264_911]),
+        (shape(4, &[3e38, 2e38, 3e38, 2e38]), [1.0, -1.0, 1.0, -1.0]),
+        (
+            shape(4, &[10_000_001.0, 10_000_002.0, 10_000_003.0, 10_000_004.0]),
+            [-1.341_635, -0.447_212, 0.447_212, 1.341_635],
+        ),
+    ];
+    for ((n, x), expected) in cases {
+        let row = constant(&[1, n], x.clone());
+        let layer = row.layer_norm(&constant(&[n], vec![1.0; n]), &constant(&[n], vec![0.0; n]), 1e-5);
+        let column = constant(&[n, 1], x);
+        let one = |v: f32| constant(&[1], vec![v]);
+        let (batch, ..) = column.batch_norm(&one(1.0), &one(0.0), 1e-5, parallax::ops::Activation::None);
+        for y in [layer, batch] {
+            for (found, expected) in y.value().data().iter().zip(expected) {
+                assert!((found - expected).abs() < 2e-5, "{:?}, expected {expected:?}", y.value().data());
+            }
+        }
+    }
+}
+
+/// Sums, means, norms, variances and the softmax family over many numbers, huge and tiny ones, and far from 0.
+#[test]
+fn reductions_keep_their_digits() {
+    let constant = |x: &[f32]| Var::constant(Tensor::from_vec([x.len()], x.to_vec()));
+    let close = |what: &str, found: f32, expected: f64, ulp: f64| {
+        let (error, _) = error(found, expected);
+        assert!(error <= ulp, "{what}: {found:e} for {expected:e}, {error} ulp");
+    };
+    let wide = |x: &[f32]| x.iter().map(|x| f64::from(*x)).collect::<Vec<_>>();
+    let many: Vec<f32> = (0..1_000_000).map(|i| 0.1 + (i % 17) as f32 * 1e-3).collect();
+    let far: Vec<f32> = (0..10_000).map(|i| 4_000_000.0 + (i % 5) as f32).collect();
+    for (name, x) in [("many", &many), ("far from 0", &far)] {
+        let numbers = wide(x);
+        let (sum, count) = (numbers.iter().sum::<f64>(), numbers.len() as f64);
+        close(&format!("sum of {name}"), constant(x).sum_all().value().item(), sum, 4.0);
+        close(&format!("mean of {name}"), constant(x).mean_all().value().item(), sum / count, 5.0);
+        let var = numbers.iter().map(|v| (v - sum / count).powi(2)).sum::<f64>() / count;
+        let found = constant(x).variance(0, 1, 0).value().item();
+        assert!((f64::from(found) / var - 1.0).abs() < 1e-4, "variance of {name}: {found} for {var}");
+        let last = constant(x).cumsum(0).value().data()[x.len() - 1];
+        assert!((f64::from(last) / sum - 1.0).abs() < 1e-4, "running sum of {name}: {last} for {sum}");
+    }
+    for (name, x) in [("huge", [3e38f32, 1e38, -2e38, 1e20]), ("tiny", [3e-39f32, 1e-40, -2e-39, 1e-45])] {
+        let norm = wide(&x).iter().map(|v| v * v).sum::<f64>().sqrt();
+        let found = constant(&x).norm(0, 1).value().item();
+        assert!((f64::from(found) / norm - 1.0).abs() < 1e-5 || norm > f64::from(f32::MAX), "norm of {name}: {found}");
+    }
+    let logits = [3e38f32, 3e38, -3e38, 0.0];
+    for (found, expected) in constant(&logits).softmax(0).value().data().iter().zip([0.5, 0.5, 0.0, 0.0]) {
+        assert_eq!(*found, expected);
+    }
+    let far = [1e6f32, 1e6 + 1.0, 1e6 - 2.0, 1e6];
+    let reference = wide(&far);
+    let total = reference.iter().map(|v| (v - 1e6).exp()).sum::<f64>();
+    for (k, found) in constant(&far).log_softmax(0).value().data().iter().enumerate() {
+        assert!((f64::from(*found) - (reference[k] - 1e6 - total.ln())).abs() < 1e-6, "log softmax {k}: {found}");
+    }
+    close("log of a sum", constant(&far).log_sum_exp(0).value().item(), 1e6 + total.ln(), 1.0);
+}

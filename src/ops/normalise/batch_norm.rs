@@ -99,16 +99,28 @@ fn statistics<T: Float>(x: &[T], c: usize, tile: usize) -> (Vec<f64>, Vec<f64>) 
     let mut before = 0.0;
     for (i, part) in parts.chunks_exact(2 * c).enumerate() {
         let here = (tile.min(rows - i * tile)) as f64;
+        let of_tile = &x[i * tile * c..((i + 1) * tile).min(rows) * c];
         let share = here / (before + here);
         for (k, (mean, squares)) in mean.iter_mut().zip(&mut squares).enumerate() {
-            let step = part[k].f64() - *mean;
+            let (mut centre, mut spread) = (part[k].f64(), part[c + k].f64());
+            if !(centre.is_finite() && spread.is_finite()) {
+                (centre, spread) = wide_statistics(of_tile.iter().skip(k).step_by(c).map(|x| x.f64()));
+            }
+            let step = centre - *mean;
             *mean += step * share;
-            *squares += part[c + k].f64() + step * step * before * share;
+            *squares += spread + step * step * before * share;
         }
         before += here;
     }
     squares.iter_mut().for_each(|s| *s /= rows as f64);
     (mean, squares)
+}
+
+/// The mean of some numbers, and the sum of squares around it, in f64: for those whose sums or squares overflow f32.
+pub(super) fn wide_statistics(x: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
+    let (sum, count) = x.clone().fold((0.0, 0.0), |(sum, count), x| (sum + x, count + 1.0));
+    let mean = sum / count;
+    (mean, x.map(|x| (x - mean) * (x - mean)).sum())
 }
 
 /// weight / sqrt(var + eps).

@@ -2,6 +2,7 @@
 
 use pulp::{Simd, WithSimd};
 
+use super::batch_norm::wide_statistics;
 use crate::ops::Tile;
 use crate::ops::support::put::put;
 use crate::ops::support::sums::{add_sums, sum_of_pairs};
@@ -61,6 +62,10 @@ impl<T: Float> WithSimd for Moments<'_, T> {
             }
             let var = var * share;
             *out = [mean, T::ONE / (var + self.eps).sqrt()];
+            if !var.is_finite() {
+                let (mean, squares) = wide_statistics(x.iter().map(|x| x.f64()));
+                *out = [T::of(mean), T::of(1.0 / (squares / c as f64 + self.eps.f64()).sqrt())];
+            }
         }
     }
 }
