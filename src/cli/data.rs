@@ -44,14 +44,27 @@ struct StreetArgs {
     moving_cars: bool,
 }
 
+/// Pictures that a street may consist of.
+const MOST_GIGABYTES: f64 = 32.0;
+
 pub fn run(args: Args) -> Result<()> {
     let What::Street(a) = args.what;
     for (name, value) in
         [("--sequences", a.sequences), ("--frames", a.frames), ("--height", a.height), ("--width", a.width)]
     {
-        if value == 0 || value > 20_000 {
-            return Err(Error::setting(name, format!("{value} is not from 1 to 20000")));
+        // A sample is a frame with both neighbours.
+        let least = if name == "--frames" { 3 } else { 1 };
+        if !(least..=20_000).contains(&value) {
+            return Err(Error::setting(name, format!("{value} is not from {least} to 20000")));
         }
+    }
+    // All pictures are held until they are written.
+    let gigabytes = 3e-9 * [a.sequences, a.frames, a.height, a.width].iter().map(|&n| n as f64).product::<f64>();
+    if gigabytes > MOST_GIGABYTES {
+        let message = format!(
+            "these pictures take {gigabytes:.0} GB of memory (at most {MOST_GIGABYTES}): fewer, or smaller ones"
+        );
+        return Err(Error::setting("--sequences", message));
     }
     let config = StreetConfig {
         height: a.height,

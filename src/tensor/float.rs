@@ -58,7 +58,7 @@ pub trait Float:
     fn f64(self) -> f64;
     /// `self * a + b` with one rounding.
     fn mul_add(self, a: Self, b: Self) -> Self;
-    /// e to this power. In `f32` a branch-free polynomial that vectorises, within 2 units in the last place.
+    /// e to this power. In `f32` a branch-free polynomial that vectorises, within a unit in the last place.
     fn exp(self) -> Self;
     /// e to this power, less 1, exact where `self` is small. In `f32` branch-free, so that it vectorises.
     fn exp_m1(self) -> Self;

@@ -319,6 +319,8 @@ fn lock(folder: &Path) -> Result<File> {
         Err(TryLockError::WouldBlock) => {
             Err(Error::file(folder, "another process is training this run: wait for it, or give another folder"))
         }
+        // Some network file systems have no locks: better a run without one than none.
+        Err(TryLockError::Error(e)) if e.kind() == std::io::ErrorKind::Unsupported => Ok(file),
         Err(TryLockError::Error(e)) => Err(Error::io(&path, e)),
     }
 }

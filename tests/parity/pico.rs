@@ -13,6 +13,8 @@ use parallax::optim::{AdamW, Group};
 use parallax::random::Random;
 use parallax::tensor::{Float, Tape, Tensor, Var};
 
+use crate::reference::{error, largest};
+
 fn fixture() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/pico.safetensors")
 }
@@ -81,14 +83,6 @@ impl<T: Float> Pico<T> {
     }
 }
 
-/// max |difference| over max |expected|.
-fn error<T: Float>(found: &Tensor<T>, expected: &Tensor<T>) -> f64 {
-    assert_eq!(found.shape(), expected.shape());
-    let largest = |it: &mut dyn Iterator<Item = f64>| it.fold(0.0, |m: f64, x| if x.is_nan() { x } else { m.max(x) });
-    let scale = largest(&mut expected.data().iter().map(|x| x.f64().abs()));
-    largest(&mut found.data().iter().zip(expected.data()).map(|(a, b)| (a.f64() - b.f64()).abs())) / scale
-}
-
 fn assert_error<T: Float>(found: &Tensor<T>, expected: &Tensor<T>, bound: f64, what: &str) {
     let e = error(found, expected);
     assert!(e <= bound, "{what}: error {e:.1e}, at most {bound:.0e} expected");
@@ -131,7 +125,7 @@ fn outputs_and_gradients<T: Float>(bound: f64, gradient_bound: f64, zero: f64) {
         let (Some(gradient), Some(expected)) = (gradient, expected) else { continue };
         compared += 1;
         let gradient = p.layout.export(gradient);
-        let scale = expected.data().iter().fold(0.0, |m: f64, x| m.max(x.f64().abs()));
+        let scale = largest(expected.data().iter().map(|x| x.f64().abs()));
         for (k, (g, e)) in gradient.data().iter().zip(expected.data()).enumerate() {
             let difference = (g.f64() - e.f64()).abs();
             let bound = gradient_bound * scale + zero;
@@ -174,7 +168,7 @@ fn three_steps_and_evaluation_in_f64() {
         let expected = pico.reference.get(&format!("after3/{}", p.name()));
         // Where the gradient is zero by construction, AdamW divides rounding noise by eps: of the order 1e-14 a step.
         let ours = p.layout.export(&p.value);
-        let scale = expected.data().iter().fold(1e-3, |m: f64, x| m.max(x.abs()));
+        let scale = largest(expected.data().iter().map(|x| x.abs()).chain([1e-3]));
         for (k, (x, e)) in ours.data().iter().zip(expected.data()).enumerate() {
             assert!((x - e).abs() <= 1e-9 * scale, "{}, element {k}: {x} for {e}", p.name());
         }

@@ -9,6 +9,8 @@ use parallax::monovit::{MonoVit, Preset};
 use parallax::nn::{Context, Folded, Params};
 use parallax::tensor::{Shape, Tensor, Var};
 
+use crate::reference::error;
+
 fn fixture(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)
 }
@@ -40,12 +42,6 @@ fn from_name(name: &str, shape: &Shape) -> Tensor<f64> {
 fn input(name: &str) -> Var<f64> {
     let image = from_name(name, &Shape::new(&[1, 3, 64, 96]));
     image.map(|x| 0.5 * x + 0.5).permute(&[0, 2, 3, 1]).into()
-}
-
-fn error(found: &Tensor<f64>, expected: &Tensor<f64>) -> f64 {
-    assert_eq!(found.shape(), expected.shape());
-    let scale = expected.data().iter().fold(0.0, |m: f64, x| m.max(x.abs()));
-    found.data().iter().zip(expected.data()).fold(0.0, |m: f64, (a, b)| m.max((a - b).abs())) / scale
 }
 
 fn check(preset: Preset) {

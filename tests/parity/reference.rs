@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use parallax::tensor::Tensor;
+use parallax::tensor::{Float, Tensor};
 use safetensors::{Dtype, SafeTensors};
 use serde_json::Value;
 
@@ -63,11 +63,31 @@ impl Layout {
     }
 }
 
-/// max |ours - expected| / max |expected|; the absolute error where all of `expected` is 0.
-pub fn error(ours: &Tensor<f64>, expected: &Tensor<f64>) -> f64 {
+/// The largest of some numbers that are not negative; NaN if one of them is, whatever follows it.
+pub fn largest(numbers: impl Iterator<Item = f64>) -> f64 {
+    numbers.fold(0.0, |most: f64, x| if most.is_nan() || x.is_nan() { f64::NAN } else { most.max(x) })
+}
+
+/// max |ours - expected| / max |expected|; the absolute error where all of `expected` is 0. NaN if there is one: every
+/// comparison of tensors goes through here, and asks whether this is at most a bound, which NaN is not.
+pub fn error<T: Float>(ours: &Tensor<T>, expected: &Tensor<T>) -> f64 {
     assert_eq!(ours.shape(), expected.shape());
-    let scale = expected.data().iter().fold(0.0, |m: f64, x| m.max(x.abs()));
-    let worst = ours.data().iter().zip(expected.data()).map(|(a, b)| (a - b).abs());
-    // Written so that NaN is not lost.
-    worst.fold(0.0, |m: f64, e| if e > m || e.is_nan() { e } else { m }) / if scale > 0.0 { scale } else { 1.0 }
+    let scale = largest(expected.data().iter().map(|x| x.f64().abs()));
+    let worst = largest(ours.data().iter().zip(expected.data()).map(|(a, b)| (a.f64() - b.f64()).abs()));
+    worst / if scale == 0.0 { 1.0 } else { scale }
+}
+
+#[test]
+fn a_comparison_never_loses_nan() {
+    let tensor = |x: [f64; 3]| Tensor::from_vec([3], x.to_vec());
+    let expected = tensor([1.0, -2.0, 0.5]);
+    assert_eq!(error(&tensor([1.0, -1.0, 0.5]), &expected), 0.5);
+    for at in 0..3 {
+        let mut broken = [1.0, -2.0, 0.5];
+        broken[at] = f64::NAN;
+        assert!(error(&tensor(broken), &expected).is_nan(), "NaN at {at}");
+        assert!(error(&expected, &tensor(broken)).is_nan(), "NaN expected at {at}");
+    }
+    assert!(error(&tensor([f64::NAN; 3]), &expected).is_nan());
+    assert_eq!(error(&tensor([1e-3, 0.0, 0.0]), &tensor([0.0; 3])), 1e-3);
 }
