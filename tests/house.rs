@@ -99,3 +99,41 @@ fn unsafe_stands_in_one_file_once() {
     }
     assert_eq!(found, [("tensor/gemm_small.rs".to_owned(), 1)]);
 }
+
+/// A size that a kernel cuts its work at is asked for (`tensor::regime`), so that checks can make it small: a constant in a
+/// cutting call is a cut that no check can cross. Registers are no matter of size: their loops are allowed by name.
+#[test]
+fn kernels_ask_for_the_sizes_at_which_they_cut() {
+    const CUTS: [&str; 7] = [
+        "chunks(",
+        "chunks_mut(",
+        "chunks_exact(",
+        "chunks_exact_mut(",
+        "step_by(",
+        "for_each_chunk(",
+        "for_each_unit(",
+    ];
+    // Registers; what a window or a sum consists of.
+    const ALLOWED: [&str; 4] = ["LANES", "TILE", "TAPS", "PARTS"];
+    let mut seen = 0;
+    for path in sources("src/ops").into_iter().chain(sources("src/optim")) {
+        let (place, text) = (place(&path), code(&path));
+        assert!(!text.contains("rayon::"), "src/{place} reaches threads past tensor::parallel");
+        for line in text.lines() {
+            for cut in CUTS {
+                for arguments in line.split(cut).skip(1) {
+                    seen += 1;
+                    let until = arguments.split(')').next().unwrap_or_default();
+                    let mut words = until.split(|c: char| !c.is_alphanumeric() && c != '_');
+                    let constant = words
+                        .into_iter()
+                        .find(|word| word.len() > 2 && word.chars().all(|c| c.is_ascii_uppercase() || c == '_'));
+                    let Some(constant) = constant else { continue };
+                    let asked = line.contains("regime::") || ALLOWED.contains(&constant);
+                    assert!(asked, "src/{place} cuts at the constant {constant}: {}", line.trim());
+                }
+            }
+        }
+    }
+    assert!(seen > 150, "{seen} cutting calls");
+}

@@ -208,7 +208,7 @@ mod tests {
             }
         };
         step(true);
-        let message = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| step(false))).err().expect("loud");
+        let message = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| step(false))).expect_err("loud");
         assert!(message.downcast_ref::<&str>().is_some_and(|m| m.contains("were not put back")));
     }
 }

@@ -131,10 +131,10 @@ pub fn phase<R>(name: &'static str, f: impl FnOnce() -> R) -> R {
 /// Calls `f(i)` for every i below `count`, on all threads, and collects the results in order; whoever listens to this
 /// thread hears what runs on the others too. As many run at a time, so each counts for its share of the time.
 pub fn map<R: Send>(count: usize, f: impl Fn(usize) -> R + Sync + Send) -> Vec<R> {
-    if !TRACE.with_borrow(Option::is_some) {
+    let Some(look_for_nan) = TRACE.with_borrow(|trace| trace.as_ref().map(|listening| listening.look_for_nan)) else {
         return parallel::map(count, usize::MAX, f);
-    }
-    let heard = parallel::map(count, usize::MAX, |i| profile(|| f(i)));
+    };
+    let heard = parallel::map(count, usize::MAX, |i| listen(look_for_nan, || f(i)));
     let at_a_time = parallel::threads().min(count) as u32;
     let (results, profiles): (Vec<R>, Vec<Profile>) = heard.into_iter().unzip();
     TRACE.with_borrow_mut(|trace| {

@@ -138,7 +138,7 @@ fn own(name: &str) -> Option<(&'static str, String)> {
             let key = DECODER_KEYS.get(number.parse::<usize>().ok()?)?;
             Some(("depth", format!("convs.{key}.{rest}")))
         }
-        "net" => Some(("pose", name.to_owned())),
+        "net" if rest.starts_with(|c: char| c.is_ascii_digit()) => Some(("pose", name.to_owned())),
         "conv1" | "bn1" | "layer1" | "layer2" | "layer3" | "layer4" => {
             Some(("pose_encoder", format!("encoder.{name}")))
         }

@@ -47,6 +47,24 @@ fn scan<T: Float>(x: &Tensor<T>, axis: usize, start: T, f: impl Fn(T, T) -> T + 
     })
 }
 
+/// Adds x to running sums, and what rounding takes from them to `lost`: the sum and what it lost together have the digits
+/// of both, however long the run is (Knuth's two-sum).
+#[inline(always)]
+fn add_without_loss<T: Float>(sums: &mut [T], lost: &mut [T], x: &[T]) {
+    for ((sum, lost), &x) in sums.iter_mut().zip(lost).zip(x) {
+        let next = *sum + x;
+        let taken = next - *sum;
+        *lost += (*sum - (next - taken)) + (x - taken);
+        *sum = next;
+    }
+}
+
+/// The running sums: an infinite one has lost nothing.
+#[inline(always)]
+fn together<T: Float>(sum: T, lost: T) -> T {
+    if lost.is_finite() { sum + lost } else { sum }
+}
+
 impl<T: Float> Op<T> for CumSum {
     /// The shape of the input.
     type Saved = Shape;
@@ -56,25 +74,42 @@ impl<T: Float> Op<T> for CumSum {
     }
 
     fn forward(&self, inputs: &[&Tensor<T>], _: &Needs) -> (Vec<Tensor<T>>, Self::Saved) {
-        (vec![scan(inputs[0], self.axis, T::ZERO, |sum, x| sum + x)], *inputs[0].shape())
+        let x = inputs[0];
+        let blocks = Blocks::of(x.shape(), self.axis, 1);
+        let y = Tensor::build(*x.shape(), |out| {
+            blocks.for_each(
+                out,
+                2 * blocks.inner,
+                #[inline(always)]
+                |o, out, scratch| {
+                    scratch.fill(T::ZERO);
+                    let (sums, lost) = scratch.split_at_mut(blocks.inner);
+                    for (out, x) in out.chunks_exact_mut(blocks.inner).zip(blocks.rows(o, x.data())) {
+                        add_without_loss(sums, lost, x);
+                        out.iter_mut().zip(sums.iter().zip(lost.iter())).for_each(|(y, (&s, &l))| *y = together(s, l));
+                    }
+                },
+            );
+        });
+        (vec![y], *x.shape())
     }
 
     /// x_k is in y_k and all that follow: dx_k = dy_k + dx_(k + 1), from the end.
     fn backward(&self, shape: Shape, upstream: Upstream<T>, sink: &mut GradSink<T>) {
         let g = upstream.only();
         let blocks = Blocks::of(&shape, self.axis, 1);
-        let (len, inner) = (blocks.len(), blocks.inner);
         sink.accumulate(0, |out, accum| {
             blocks.for_each(
                 out,
-                inner,
+                2 * blocks.inner,
                 #[inline(always)]
-                |o, out, rest| {
-                    rest.fill(T::ZERO);
-                    let rows = g.data()[o * len..][..len].chunks_exact(inner);
-                    for (out, g) in out.chunks_exact_mut(inner).zip(rows).rev() {
-                        rest.iter_mut().zip(g).for_each(|(r, &g)| *r += g);
-                        put(accum, out.iter_mut().zip(rest.iter().copied()));
+                |o, out, scratch| {
+                    scratch.fill(T::ZERO);
+                    let (sums, lost) = scratch.split_at_mut(blocks.inner);
+                    for (out, g) in out.chunks_exact_mut(blocks.inner).zip(blocks.rows(o, g.data())).rev() {
+                        add_without_loss(sums, lost, g);
+                        let rest = sums.iter().zip(lost.iter()).map(|(&s, &l)| together(s, l));
+                        put(accum, out.iter_mut().zip(rest));
                     }
                 },
             );
