@@ -113,6 +113,26 @@ struct Suite {
     table: BTreeMap<(&'static str, String), Crossed>,
     failures: Vec<String>,
     runs: usize,
+    /// The cuts that were made.
+    #[cfg(mutants)]
+    cuts: Vec<Cut>,
+    /// A bug that is planted while kernels run with small pieces.
+    #[cfg(mutants)]
+    planted: Option<(&'static str, u32, regime::mutants::Bug)>,
+}
+
+impl Suite {
+    fn new() -> Self {
+        Suite {
+            table: BTreeMap::new(),
+            failures: Vec::new(),
+            runs: 0,
+            #[cfg(mutants)]
+            cuts: Vec::new(),
+            #[cfg(mutants)]
+            planted: None,
+        }
+    }
 }
 
 impl Suite {
@@ -153,11 +173,15 @@ impl Suite {
                 })
             })
             .collect();
+        #[cfg(mutants)]
+        regime::mutants::plant(self.planted);
         for size in SIZES {
             regime::shrink(size);
             self.runs += 1;
             let (found, cuts) =
                 parallel::with_threads(1, || regime::record(|| outcome(&run, &inputs, &tracked, &seeds, None)));
+            #[cfg(mutants)]
+            self.cuts.extend(&cuts);
             for cut in &cuts {
                 let file = cut.place.file().rsplit_once("src/").map_or(cut.place.file(), |(_, file)| file);
                 let place = format!("{file}:{}", cut.place.line());
@@ -211,19 +235,29 @@ impl Suite {
                 }
             }
             regime::shrink(0);
+            #[cfg(mutants)]
+            if !self.failures.is_empty() {
+                break;
+            }
         }
+        #[cfg(mutants)]
+        regime::mutants::plant(None);
     }
 }
 
+/// The sizes are a switch of the whole process: tests take turns.
+static TURN: std::sync::Mutex<()> = std::sync::Mutex::new(());
+
 #[test]
 fn every_piece_of_work_is_checked() {
-    let mut suite = Suite { table: BTreeMap::new(), failures: Vec::new(), runs: 0 };
+    let _turn = TURN.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let mut suite = Suite::new();
     for entry in registry::all() {
         for case in entry.cases() {
             suite.case(case.as_ref());
         }
     }
-    let Suite { table, mut failures, runs } = suite;
+    let Suite { table, mut failures, runs, .. } = suite;
     for ((op, place), crossed) in &table {
         let Crossed { cases, most, shorter, whole, by_length } = crossed;
         println!("{op:24} {place:40} {cases:5} times, at most {most:5} pieces");
@@ -236,4 +270,57 @@ fn every_piece_of_work_is_checked() {
     }
     println!("{} cuts, {runs} cases with small pieces", table.len());
     assert!(failures.is_empty(), "{} failures:\n{}", failures.len(), failures.join("\n"));
+}
+
+/// Bugs planted in the kernels themselves, at every cut of every op: each has to be noticed by the checks of an op that
+/// makes the cut. `RUSTFLAGS="--cfg mutants" cargo test --test cuts planted -- --nocapture`
+#[cfg(mutants)]
+#[test]
+fn planted_bugs_are_noticed() {
+    use parallax::tensor::pool;
+    use parallax::tensor::regime::mutants::{Bug, plant};
+
+    let _turn = TURN.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let entries = registry::all();
+    // Which ops make which cuts.
+    let mut places: BTreeMap<(&'static str, u32), Vec<usize>> = BTreeMap::new();
+    for (k, entry) in entries.iter().enumerate() {
+        for case in entry.cases() {
+            let mut suite = Suite::new();
+            suite.case(case.as_ref());
+            for cut in suite.cuts {
+                let file = cut.place.file().rsplit_once("src/").map_or(cut.place.file(), |(_, file)| file);
+                let ops = places.entry((file, cut.place.line())).or_default();
+                if !ops.contains(&k) {
+                    ops.push(k);
+                }
+            }
+        }
+    }
+    // What a piece that is not computed leaves behind must not be the right numbers of the time before.
+    pool::set_poison(true);
+    let (mut planted, mut survivors) = (0, Vec::new());
+    for (&(file, line), ops) in &places {
+        for &k in ops {
+            for bug in Bug::ALL {
+                planted += 1;
+                let mut suite = Suite { planted: Some((file, line, bug)), ..Suite::new() };
+                let mut noticed = false;
+                for case in entries[k].cases() {
+                    suite.case(case.as_ref());
+                    if !suite.failures.is_empty() {
+                        noticed = true;
+                        break;
+                    }
+                }
+                if !noticed {
+                    survivors.push(format!("{}: {bug:?} at {file}:{line}", entries[k].name));
+                }
+            }
+        }
+    }
+    plant(None);
+    pool::set_poison(false);
+    println!("{planted} bugs planted at {} cuts, {} not noticed", places.len(), survivors.len());
+    assert!(survivors.is_empty(), "{}", survivors.join("\n"));
 }

@@ -86,7 +86,24 @@ fn split<T: Send>(data: &mut [T], chunk: usize, first: usize, f: &(dyn Fn(usize,
 
 /// The one place where work is handed over. The kernel comes as a `dyn Fn`: it is compiled once, not once for each way
 /// of running it, and the machinery once for each element type.
-fn cut<T: Send>(data: &mut [T], chunk: usize, work: usize, f: &(dyn Fn(usize, &mut [T]) + Sync)) {
+fn cut<T: Send>(
+    data: &mut [T],
+    chunk: usize,
+    work: usize,
+    place: &'static Location<'static>,
+    f: &(dyn Fn(usize, &mut [T]) + Sync),
+) {
+    #[cfg(mutants)]
+    if let Some(bug) = regime::mutants::at(place) {
+        let (count, single) = (data.len().div_ceil(chunk), size_of::<T>() == 4);
+        for (i, piece) in data.chunks_mut(chunk).enumerate() {
+            if let Some(other) = bug.instead(i, count, single) {
+                f(other, piece);
+            }
+        }
+        return;
+    }
+    let _ = place;
     if stays(data.len().div_ceil(chunk), work) {
         data.chunks_mut(chunk).enumerate().for_each(|(i, c)| f(i, c));
     } else {
@@ -104,7 +121,7 @@ pub fn for_each(count: usize, work: usize, f: impl Fn(usize) + Sync + Send) {
 /// Nothing to be cut but the indices: the threads' machinery is compiled once for all that runs by index.
 fn indices(count: usize, work: usize, place: &'static Location<'static>, f: &(dyn Fn(usize) + Sync)) {
     regime::note(place, count, None);
-    cut(&mut vec![(); count], 1, work, &|i, _| f(i));
+    cut(&mut vec![(); count], 1, work, place, &|i, _| f(i));
 }
 
 /// Collects `f(i)` for every i below `count`, in order.
@@ -119,8 +136,9 @@ pub fn map<R: Send>(count: usize, work: usize, f: impl Fn(usize) -> R + Sync + S
 #[track_caller]
 pub fn for_each_chunk<T: Send>(data: &mut [T], chunk: usize, work: usize, f: impl Fn(usize, &mut [T]) + Sync + Send) {
     let chunk = chunk.max(1);
-    regime::note(Location::caller(), data.len().div_ceil(chunk), Some(!data.len().is_multiple_of(chunk)));
-    cut(data, chunk, work, &f);
+    let place = Location::caller();
+    regime::note(place, data.len().div_ceil(chunk), Some(!data.len().is_multiple_of(chunk)));
+    cut(data, chunk, work, place, &f);
 }
 
 /// Cuts `data` into units of `unit` elements each (rows, images, matrices) and calls `f(index, unit)` for each.
@@ -132,7 +150,7 @@ pub fn for_each_unit<T: Send>(data: &mut [T], unit: usize, work: usize, f: impl 
     assert!(data.len().is_multiple_of(unit.max(1)), "{} elements in units of {unit}", data.len());
     let place = Location::caller();
     regime::note(place, data.len() / unit.max(1), None);
-    cut(data, unit.max(1), work, &f);
+    cut(data, unit.max(1), work, place, &f);
 }
 
 /// Calls `f` for every piece: for kernels that write several slices, cut and zipped by the caller.

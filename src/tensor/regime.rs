@@ -61,12 +61,73 @@ pub(crate) fn note(place: &'static Location<'static>, pieces: usize, rest: Optio
     });
 }
 
+/// A bug planted at one cut, to see whether the checks notice: only in builds with `--cfg mutants`.
+#[cfg(mutants)]
+pub mod mutants {
+    use std::panic::Location;
+    use std::sync::Mutex;
+
+    /// What goes wrong at the cut.
+    #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+    pub enum Bug {
+        /// The last of several pieces is not computed.
+        DropsLast,
+        /// Pieces beyond the second are not computed.
+        DropsBeyondSecond,
+        /// Every piece after the first is computed as the one before it.
+        ReadsPrevious,
+        /// Every piece but the first is computed as the first.
+        ReadsFirst,
+        /// The last of several pieces is not computed, in f32 alone.
+        DropsLastInSingle,
+    }
+
+    impl Bug {
+        /// All of them.
+        pub const ALL: [Bug; 5] =
+            [Bug::DropsLast, Bug::DropsBeyondSecond, Bug::ReadsPrevious, Bug::ReadsFirst, Bug::DropsLastInSingle];
+
+        /// The piece that is computed in the place of piece `i` of `count`, if one is.
+        pub(crate) fn instead(self, i: usize, count: usize, single: bool) -> Option<usize> {
+            match self {
+                Bug::DropsLast if i > 0 && i + 1 == count => None,
+                Bug::DropsLastInSingle if single && i > 0 && i + 1 == count => None,
+                Bug::DropsBeyondSecond if i > 1 => None,
+                Bug::ReadsPrevious => Some(i.saturating_sub(1)),
+                Bug::ReadsFirst => Some(0),
+                _ => Some(i),
+            }
+        }
+    }
+
+    static PLANTED: Mutex<Option<(&'static str, u32, Bug)>> = Mutex::new(None);
+
+    /// Plants a bug at a cut (the end of its file's path, and its line), or takes it away.
+    pub fn plant(bug: Option<(&'static str, u32, Bug)>) {
+        *PLANTED.lock().expect("no panic holds this lock") = bug;
+    }
+
+    /// The bug at a place.
+    pub(crate) fn at(place: &Location) -> Option<Bug> {
+        let planted = *PLANTED.lock().expect("no panic holds this lock");
+        planted.filter(|(file, line, _)| place.file().ends_with(file) && place.line() == *line).map(|(_, _, bug)| bug)
+    }
+}
+
 /// Cuts a range into runs of `usual` (see [`size`]), the last of which may be shorter: for loops inside a thread.
 #[track_caller]
 pub fn blocks(range: Range<usize>, usual: usize) -> impl Iterator<Item = Range<usize>> {
     let block = size(usual).max(1);
     note(Location::caller(), range.len().div_ceil(block), Some(!range.len().is_multiple_of(block)));
-    range.clone().step_by(block).map(move |first| first..(first + block).min(range.end))
+    let runs = range.clone().step_by(block).map(move |first| first..(first + block).min(range.end));
+    #[cfg(mutants)]
+    let runs = {
+        let (bug, all) = (mutants::at(Location::caller()), runs.collect::<Vec<_>>());
+        let kept = all.clone().into_iter().enumerate();
+        kept.filter(move |(i, _)| bug.is_none_or(|bug| bug.instead(*i, all.len(), false) == Some(*i)))
+            .map(|(_, run)| run)
+    };
+    runs
 }
 
 #[cfg(test)]
