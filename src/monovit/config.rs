@@ -5,37 +5,37 @@ use serde::{Deserialize, Serialize};
 use crate::error::{Error, Result};
 use crate::nn::Start;
 
-/// Everything that decides the shapes of the four networks.
+/// Configuration of the four networks: everything that decides their shapes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
-    /// Channels d0..d3 of the encoder's stages.
+    /// Number of channels d0..d3 of the encoder's stages.
     pub channels: [usize; 4],
-    /// Transformer layers in each stage's paths.
+    /// Number of transformer layers in each path of a stage.
     pub layers: [usize; 4],
-    /// Transformer paths in each stage; with 0 the CNN path stands alone.
+    /// Number of transformer paths in each stage; with 0 the CNN path stands alone.
     pub paths: [usize; 4],
     /// Whether a CNN path (the inverted residual block) stands beside the transformer paths of each stage.
     #[serde(default = "yes")]
     pub cnn_path: bool,
-    /// Hidden channels of the transformer's MLP, over its channels.
+    /// Expansion ratio of the transformer's MLP: hidden channels over channels.
     pub mlp_ratio: usize,
-    /// Attention heads.
+    /// Number of attention heads.
     pub heads: usize,
     /// The windows of the convolutional relative position, each with its heads.
     pub windows: Vec<(usize, usize)>,
-    /// The largest DropPath probability; layers grow towards it.
+    /// Largest DropPath (stochastic depth) probability; it grows linearly over the layers.
     pub drop_path: f64,
     /// Whether the decoder weighs channels by attention; without, the convolutions behind it stand alone.
     #[serde(default = "yes")]
     pub decoder_attention: bool,
-    /// The decoder's channel attention squeezes by this.
+    /// Reduction ratio of the decoder's channel attention.
     pub reduction: usize,
-    /// Channels of the pose ResNet's first stage.
+    /// Number of channels of the pose ResNet's first stage.
     pub pose_width: usize,
-    /// Channels of the pose decoder.
+    /// Number of channels of the pose decoder.
     pub pose_squeeze: usize,
-    /// How weights start.
+    /// Initialisation of the weights.
     pub start: Start,
 }
 
@@ -48,8 +48,8 @@ fn yes() -> bool {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Ablation {
-    /// At most so many transformer paths in every stage. The published sizes have 2, 3, 3, 3, so that 2 leaves the first
-    /// stage as it is; 1 keeps the path with the smallest window; 0 leaves the CNN path alone.
+    /// At most so many transformer paths in every stage. The published sizes have 2, 3, 3, 3, so that 2 leaves the
+    /// first stage as it is; 1 keeps the path with the smallest window; 0 leaves the CNN path alone.
     pub transformer_paths: Option<usize>,
     /// Whether the CNN path stays.
     pub cnn_path: bool,
@@ -112,11 +112,11 @@ pub enum Preset {
 }
 
 impl Preset {
-    /// All of them.
+    /// All presets, smallest first.
     pub const ALL: [Preset; 6] =
         [Preset::Pico, Preset::Nano, Preset::Tiny, Preset::Xsmall, Preset::Small, Preset::Base];
 
-    /// The name on the command line.
+    /// Name on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Preset::Pico => "pico",
@@ -128,7 +128,7 @@ impl Preset {
         }
     }
 
-    /// The sizes.
+    /// Its configuration.
     pub fn config(self) -> Config {
         let published = |channels, layers, mlp_ratio| Config {
             channels,

@@ -1,8 +1,8 @@
-//! The depth decoder: nested (U-Net++-like) with channel attention on its diagonal (MonoViT, section 3.3; after HR-Depth,
-//! 2012.07356, and DIFFNet, 2110.09482).
+//! The depth decoder: nested (U-Net++-like) with channel attention on its diagonal (MonoViT, section 3.3; after
+//! HR-Depth, 2012.07356, and DIFFNet, 2110.09482).
 //!
-//! Node (i, j) stands at level i (1/2^(i+1) of the image) in column j. It joins the node below and before it, upsampled,
-//! with all the nodes to its left.
+//! Node (i, j) stands at level i (1/2^(i+1) of the image) in column j. It joins the node below and before it,
+//! upsampled, with all the nodes to its left.
 
 use std::collections::BTreeMap;
 
@@ -11,7 +11,8 @@ use crate::nn::{Builder, Context, Conv, ConvStart, Init, Joined, Linear};
 use crate::ops::{Activation, Conv2d};
 use crate::tensor::{Float, Var};
 
-/// The five maps of the encoder to disparities (sigmoid, in [0, 1]) at 1, 1/2, 1/4, 1/8 of the image.
+/// Depth decoder: from the five maps of the encoder to disparities (sigmoid, in [0, 1]) at 1, 1/2, 1/4, 1/8 of the
+/// image.
 #[derive(Clone, Debug)]
 pub struct Decoder {
     /// Brings the encoder's maps 1..4 to the channels of the first column.
@@ -174,8 +175,8 @@ impl AttentionConv {
     }
 }
 
-/// The gate of channel attention (Hu et al., 1709.01507), by which an image z is multiplied, here of channels from several
-/// images: sigmoid(fc2(relu(fc0(mean of z over the image)))).
+/// The gate of channel attention (Hu et al., 1709.01507), by which an image z is multiplied, here of channels from
+/// several images: sigmoid(fc2(relu(fc0(mean of z over the image)))).
 #[derive(Clone, Debug)]
 struct ChannelAttention {
     squeeze: Linear,

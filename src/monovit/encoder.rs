@@ -8,7 +8,8 @@ use crate::nn::{Builder, Context, Conv, ConvBn, ConvStart, DepthwiseConv, Init, 
 use crate::ops::{Activation, Conv2d};
 use crate::tensor::{Float, Var};
 
-/// RGB in [0, 1], `[B, H, W, 3]` with H and W multiples of 32, to five maps at 1/2, 1/4, 1/8, 1/16, 1/32.
+/// MPViT encoder: from RGB in [0, 1], `[B, H, W, 3]` with H and W multiples of 32, to five maps at 1/2, 1/4, 1/8, 1/16,
+/// 1/32.
 #[derive(Clone, Debug)]
 pub struct Encoder {
     stem: [ConvBn; 2],

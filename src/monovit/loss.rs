@@ -8,7 +8,7 @@ use crate::error::{Error, Result};
 use crate::random::Random;
 use crate::tensor::{Float, Tensor, Var, profile};
 
-/// What is made of the photometric errors of a pixel's sources.
+/// How a pixel's photometric errors over its source frames are combined.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "cli", derive(clap::ValueEnum))]
@@ -16,12 +16,12 @@ pub enum Reprojection {
     /// The smallest: a source that does not see the pixel is left out (Monodepth2, section 3.2).
     #[default]
     Minimum,
-    /// Their mean, as before Monodepth2. Auto-masking then takes the smaller of two means: of the warped sources, and of
-    /// the unwarped ones.
+    /// Their mean, as before Monodepth2. Auto-masking then takes the smaller of two means: of the warped sources, and
+    /// of the unwarped ones.
     Average,
 }
 
-/// The size at which the disparities of the smaller scales are compared.
+/// Resolution at which the loss of the smaller disparities is computed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "cli", derive(clap::ValueEnum))]
@@ -37,21 +37,22 @@ pub enum Scales {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LossConfig {
-    /// Disparity 1 means this depth.
+    /// Least depth, that of disparity 1.
     pub min_depth: f64,
-    /// Disparity 0 means this depth.
+    /// Greatest depth, that of disparity 0.
     pub max_depth: f64,
-    /// The share of SSIM in the photometric error; the rest is the absolute difference. With 0 SSIM is not computed.
+    /// Weight of SSIM in the photometric error, in [0, 1]; the rest is the absolute difference. With 0 SSIM is not
+    /// computed.
     pub ssim: f64,
-    /// What is made of the errors of a pixel's sources.
+    /// How a pixel's errors over its source frames are combined.
     pub reprojection: Reprojection,
-    /// The size at which smaller disparities are compared.
+    /// Resolution at which the loss of the smaller disparities is computed.
     pub scales: Scales,
     /// The weight of the smoothness term at full size; halved with every scale.
     pub smoothness: f64,
-    /// Whether pixels that an unwarped neighbour explains better are left out.
+    /// Auto-masking: whether pixels that an unwarped neighbour explains better are left out.
     pub auto_mask: bool,
-    /// The deviation of the noise that decides between equal errors.
+    /// Standard deviation of the noise that decides between equal errors.
     pub tie_break: f64,
     /// Whether the sampling grid is made for the convention it is sampled with (pixel centres), instead of the
     /// published combination (made for aligned corners, sampled without).
@@ -94,7 +95,7 @@ impl LossConfig {
     }
 }
 
-/// What the loss compares: plain images, not the jittered ones that the networks see.
+/// Images that the loss compares: the plain ones, not the jittered ones that the networks see.
 pub struct Views<T: Float> {
     /// The target at 1, 1/2, 1/4, 1/8 of its size, `[B, h, w, 3]`.
     pub pyramid: Vec<Var<T>>,
@@ -108,7 +109,7 @@ pub struct Views<T: Float> {
 
 /// The loss and what it is made of (means over the scales).
 pub struct Loss<T: Float> {
-    /// The number to go down from.
+    /// The total loss, a scalar: what training minimises.
     pub total: Var<T>,
     /// The mean of the per-pixel minimum of photometric errors.
     pub photometric: f64,
@@ -118,11 +119,11 @@ pub struct Loss<T: Float> {
     pub unwarped: f64,
     /// The smoothness term, weighted.
     pub smoothness: f64,
-    /// The share of pixels that a warped neighbour explains best: what auto-masking leaves in.
+    /// Share of pixels that auto-masking leaves in: those that a warped neighbour explains best.
     pub auto_mask: f64,
 }
 
-/// Normal numbers to break ties with, drawn once; every use starts at a random place among them.
+/// Gaussian noise that breaks ties, drawn once; every use starts at a random place in it.
 pub struct TieBreak<T> {
     numbers: Vec<T>,
 }

@@ -8,7 +8,8 @@ use crate::nn::{Builder, Context, Folded, Params};
 use crate::random::{Random, Stream};
 use crate::tensor::{Float, Tensor, Var, profile};
 
-/// Depth encoder and decoder, pose encoder and decoder: `encoder`, `depth`, `pose_encoder`, `pose` in a checkpoint.
+/// MonoViT: depth encoder and decoder, pose encoder and decoder: `encoder`, `depth`, `pose_encoder`, `pose` in a
+/// checkpoint.
 #[derive(Clone, Debug)]
 pub struct MonoVit {
     /// The sizes.
@@ -46,7 +47,8 @@ impl MonoVit {
         self.depth.forward(c, &self.features(c, image))
     }
 
-    /// The same as plain data, for pictures that nobody trains on: nothing is recorded, and normalisations are folded.
+    /// [`disparities`](MonoVit::disparities) for inference, as plain tensors: nothing is recorded, and normalisations
+    /// are folded into convolutions.
     ///
     /// Pictures run side by side, one on a thread, so that what a layer computes is still in its core's cache when the
     /// next one reads it.

@@ -5,7 +5,7 @@ use crate::nn::{Builder, Context, Conv, ConvBn, ConvStart};
 use crate::ops::{Activation, Conv2d};
 use crate::tensor::{Float, Var};
 
-/// ResNet-18 on two frames, concatenated on channels; the last map goes on.
+/// Pose encoder: ResNet-18 on two frames, concatenated along the channels; its last map goes on.
 #[derive(Clone, Debug)]
 pub struct PoseEncoder {
     stem: ConvBn,

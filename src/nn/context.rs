@@ -9,7 +9,7 @@ use super::params::{Identity, ParamId, Params};
 use crate::random::{Random, Stream};
 use crate::tensor::{Float, Gradients, Tape, Tensor, Var, profile};
 
-/// What normalisations do.
+/// Mode of normalisation layers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Mode {
     /// Use and move the statistics of the batch.
@@ -20,7 +20,7 @@ enum Mode {
     Folded,
 }
 
-/// What a module needs besides its input.
+/// Context of one forward pass: the parameters as variables, the mode, running statistics, dropout's random numbers.
 ///
 /// A training step ends with [`into_moved`](Context::into_moved), which gives the running statistics that it moved: a
 /// context that gave its gradients and is dropped with statistics in it panics, because a model whose statistics stay
@@ -70,20 +70,20 @@ impl<T: Float> Context<T> {
         Context { vars, identities, mode, moved, random, seen: None, differentiated: Cell::new(false) }
     }
 
-    /// The same pass, looked at: what modules [`observe`](Context::observe) is kept.
+    /// This pass with intermediate values kept: those that modules [`observe`](Context::observe).
     pub fn observed(mut self) -> Self {
         self.seen = Some(RefCell::default());
         self
     }
 
-    /// Shows an intermediate value to whoever looks, under the path of its module. Nothing happens if nobody does.
+    /// Records an intermediate value under the path of its module, if this pass is [`observed`](Context::observed).
     pub fn observe(&self, name: &str, value: &Var<T>) {
         if let Some(seen) = &self.seen {
             seen.borrow_mut().insert(name.to_owned(), value.value().clone());
         }
     }
 
-    /// Takes what the module of this name showed last, if this pass is [`observed`](Context::observed).
+    /// Takes the value that the module of this name recorded last, if this pass is [`observed`](Context::observed).
     pub fn take_observed(&self, name: &str) -> Option<Tensor<T>> {
         self.seen.as_ref()?.borrow_mut().remove(name)
     }
@@ -135,12 +135,12 @@ impl<T: Float> Context<T> {
         x * Var::constant(Tensor::from_vec(&dims, mask))
     }
 
-    /// Ends the pass: the running statistics it moved.
+    /// Ends the pass and returns the running statistics that it has updated.
     pub fn into_moved(self) -> HashMap<ParamId, Tensor<T>> {
         std::mem::take(&mut *self.moved.borrow_mut())
     }
 
-    /// The gradient of every parameter that the output depends on.
+    /// Gradients of the parameters, in their order; `None` for those that the output does not depend on.
     pub fn gradients(&self, gradients: &mut Gradients<T>) -> Vec<Option<Tensor<T>>> {
         self.differentiated.set(true);
         profile::phase("leaves to gradients", || self.vars.iter().map(|v| gradients.take(v)).collect())

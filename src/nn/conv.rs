@@ -12,7 +12,7 @@ pub struct Conv {
     op: Conv2d,
 }
 
-/// Images side by side along their channels, as a convolution reads them: nothing is concatenated, nothing enlarged.
+/// Concatenation of images along their channels that is never made: a convolution reads the parts where they lie.
 #[derive(Clone)]
 pub struct Joined<'a, T: Float> {
     /// The first one at half the size of the others, `[B, H / 2, W / 2, ..]`, each of whose pixels stands for four; it
@@ -23,7 +23,7 @@ pub struct Joined<'a, T: Float> {
 }
 
 impl<'a, T: Float> Joined<'a, T> {
-    /// All of them.
+    /// All its images.
     pub fn images(&self) -> impl Iterator<Item = &'a Var<T>> {
         self.small.into_iter().chain(self.parts.iter().copied())
     }
@@ -35,7 +35,7 @@ impl<'a, T: Float> From<&'a Var<T>> for Joined<'a, T> {
     }
 }
 
-/// How a convolution starts, and whether it has a bias.
+/// Initialisation of a convolution, and whether it has a bias.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ConvStart {
     /// He's normal by fan out (or as the builder's [`Start`](super::Start) has it), no bias: in front of a
@@ -90,7 +90,7 @@ impl Conv {
         }
     }
 
-    /// The same convolution with an activation behind it.
+    /// This convolution with an activation applied to its result.
     pub fn activated(mut self, activation: Activation) -> Self {
         self.op = self.op.activated(activation);
         self

@@ -12,7 +12,7 @@ use crate::formats::StoredTensor;
 use crate::formats::pth::shown;
 use crate::tensor::{Float, Tensor};
 
-/// A tensor of a file, and which parameter it is meant for.
+/// Tensor of a file, with the name of the parameter that it is meant for.
 #[derive(Clone, Debug)]
 pub struct Named {
     /// The parameter's name, any of its names.
@@ -41,11 +41,11 @@ pub struct Mismatch {
 pub struct Skipped {
     /// The name in the file.
     pub name: String,
-    /// What it is, in the plural.
+    /// Kind of tensor, in the plural, for messages.
     pub what: &'static str,
 }
 
-/// What came of comparing files with a model.
+/// Report of loading weights: what matched, what is missing, what was not expected.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Report {
     /// Parameters that a tensor fits, under their own names.

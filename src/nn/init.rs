@@ -5,12 +5,12 @@ use serde::{Deserialize, Serialize};
 use crate::random::Random;
 use crate::tensor::{Float, Shape, Tensor};
 
-/// A distribution to draw the starting values from.
+/// Initialisation: the distribution of a parameter's starting values.
 #[derive(Clone, Copy, Debug)]
 pub enum Init {
-    /// The same number everywhere.
+    /// Constant.
     Constant(f64),
-    /// Normal with mean 0.
+    /// Normal with mean 0 and this standard deviation.
     Normal(f64),
     /// Normal with mean 0, drawn again where it is more than two (absolute) away: at these deviations, never.
     TruncatedNormal(f64),
@@ -18,7 +18,7 @@ pub enum Init {
     FanIn(usize),
 }
 
-/// Which starting values a model's layers in front of a normalisation get.
+/// Initialisation of the layers in front of a normalisation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Start {

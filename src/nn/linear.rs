@@ -3,7 +3,7 @@
 use super::{Builder, Context, Init, Layout, ParamId};
 use crate::tensor::{Float, Var};
 
-/// `y = x w (+ b)`, weight `[in, out]`.
+/// Linear layer `y = x w (+ b)` with weight `[in, out]` and bias `[out]`.
 #[derive(Clone, Debug)]
 pub struct Linear {
     weight: ParamId,
@@ -24,7 +24,7 @@ impl Linear {
         x.linear(c.var(self.weight), self.bias.map(|b| c.var(b)))
     }
 
-    /// The same of gelu(x), `[.., in] -> [.., out]`.
+    /// The layer applied to gelu(x), `[.., in] -> [.., out]`.
     #[track_caller]
     pub fn forward_of_gelu<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
         x.gelu_linear(c.var(self.weight), self.bias.map(|b| c.var(b)))

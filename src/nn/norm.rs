@@ -20,7 +20,7 @@ pub struct BatchNorm {
 impl BatchNorm {
     /// Added to the variance under the root.
     pub const EPS: f64 = 1e-5;
-    /// The share of a new batch in the running statistics.
+    /// Momentum: the share of a new batch in the running statistics.
     pub const MOMENTUM: f64 = 0.1;
 
     /// The parameters stand directly under the builder's path.

@@ -9,7 +9,7 @@ use super::init::{Init, Start};
 use crate::random::Random;
 use crate::tensor::{Float, Shape, Tensor};
 
-/// Which parameter: an index into [`Params`], and what stands there.
+/// Identifier of a parameter: its index in [`Params`], and its name and shape.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct ParamId {
     index: usize,
@@ -79,7 +79,7 @@ pub(crate) fn same_model(who: &str, made_for: &[Identity], given: &[Identity]) {
     panic!("{who} was made for other parameters: number {at} was {}, and is {} here", name(made_for), name(given));
 }
 
-/// How a tensor lies in a PyTorch checkpoint, beside how it lies here.
+/// Memory layout of a parameter in a PyTorch checkpoint, relative to this crate's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Layout {
     /// The same.
@@ -145,7 +145,7 @@ impl<T: Float> Param<T> {
     }
 }
 
-/// All the tensors of a model.
+/// Parameters of a model: learnt weights and running statistics, by name.
 #[derive(Clone, Debug, Default)]
 pub struct Params<T: Float> {
     all: Vec<Param<T>>,
@@ -156,7 +156,7 @@ pub struct Params<T: Float> {
 }
 
 impl<T: Float> Params<T> {
-    /// No tensors.
+    /// Parameters of an empty model.
     pub fn new() -> Self {
         Params { all: Vec::new(), identities: Arc::default(), by_name: HashMap::new(), normalised: Vec::new() }
     }
@@ -167,17 +167,17 @@ impl<T: Float> Params<T> {
         self.all.iter().enumerate().map(of)
     }
 
-    /// How many there are.
+    /// Number of parameters.
     pub fn len(&self) -> usize {
         self.all.len()
     }
 
-    /// Whether there is none.
+    /// Whether there are none.
     pub fn is_empty(&self) -> bool {
         self.all.is_empty()
     }
 
-    /// One of them.
+    /// A parameter.
     pub fn get(&self, id: ParamId) -> &Param<T> {
         self.check(id);
         &self.all[id.index]
@@ -193,13 +193,13 @@ impl<T: Float> Params<T> {
         id.check(self.identities.get(id.index));
     }
 
-    /// The numbers of one of them, to be changed.
+    /// The value of a parameter, mutable.
     pub fn value_mut(&mut self, id: ParamId) -> &mut Tensor<T> {
         self.check(id);
         &mut self.all[id.index].value
     }
 
-    /// Replaces the numbers of one of them.
+    /// Replaces the value of a parameter.
     ///
     /// # Panics
     /// If the shape differs.
@@ -216,7 +216,7 @@ impl<T: Float> Params<T> {
         self.by_name.get(name).copied()
     }
 
-    /// How many numbers are learnt under names that begin with `prefix`.
+    /// Number of learnt scalars in the parameters whose names begin with `prefix`.
     pub fn count(&self, prefix: &str) -> usize {
         self.all.iter().filter(|p| p.learnt && p.name().starts_with(prefix)).map(|p| p.value.len()).sum()
     }
@@ -261,7 +261,7 @@ impl<T: Float> Params<T> {
     }
 }
 
-/// Makes parameters as modules ask for them, under a path that grows with [`Builder::at`].
+/// Builder that creates a module's parameters under a path, which grows with [`Builder::at`].
 pub struct Builder<'a, T: Float> {
     params: &'a mut Params<T>,
     random: &'a mut Random,

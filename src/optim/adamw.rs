@@ -5,16 +5,16 @@ use std::sync::Arc;
 use crate::nn::{Identity, Params, same_model};
 use crate::tensor::{Float, Tensor, parallel, regime, simd};
 
-/// The settings of a group of parameters.
+/// Settings of a parameter group.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Group {
     /// The learning rate.
     pub learning_rate: f64,
-    /// The decay: each step shrinks a weight by `learning_rate * decay` of itself.
+    /// Weight decay: each step shrinks a weight by `learning_rate * decay` of itself.
     pub decay: f64,
 }
 
-/// The optimiser's state: first and second moments of every parameter's gradient.
+/// AdamW optimiser: first and second moments of every parameter's gradient.
 ///
 /// With bias correction, for gradient g at step t:
 /// m = b1 m + (1 - b1) g, v = b2 v + (1 - b2) g^2,
@@ -22,20 +22,20 @@ pub struct Group {
 /// A parameter without a gradient is not touched, not even by the decay.
 #[derive(Clone, Debug)]
 pub struct AdamW<T: Float> {
-    /// b1 and b2.
+    /// Decay rates b1 and b2 of the moments.
     pub betas: [f64; 2],
-    /// Added to the root.
+    /// Added to the square root of the second moment.
     pub eps: f64,
     /// m and v, in the order of the parameters; none yet for a parameter that had no gradient.
     pub moments: Vec<Option<[Tensor<T>; 2]>>,
-    /// Steps taken.
+    /// Number of steps taken.
     pub steps: u64,
     /// The parameters that it was made for.
     identities: Arc<Vec<Identity>>,
 }
 
 impl<T: Float> AdamW<T> {
-    /// No steps taken, betas 0.9 and 0.999, eps 1e-8.
+    /// An optimiser that has taken no steps, with betas 0.9 and 0.999 and eps 1e-8.
     pub fn new(params: &Params<T>) -> Self {
         AdamW {
             betas: [0.9, 0.999],
@@ -49,8 +49,8 @@ impl<T: Float> AdamW<T> {
     /// One step. `gradients` are in the order of the parameters; `group` gives each parameter's settings by its name.
     ///
     /// # Panics
-    /// If the parameters are not those of the model that it was made for: names the first that differs. If a gradient has
-    /// another shape than its parameter.
+    /// If the parameters are not those of the model that it was made for: names the first that differs. If a gradient
+    /// has another shape than its parameter.
     pub fn step(&mut self, params: &mut Params<T>, gradients: &[Option<Tensor<T>>], group: impl Fn(&str) -> Group) {
         same_model("AdamW", &self.identities, &params.identities());
         self.steps += 1;

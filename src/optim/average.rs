@@ -8,8 +8,8 @@ use crate::tensor::{Float, Tensor, parallel, regime, simd};
 /// Elements handed to a thread at a time.
 const CHUNK: usize = 1 << 14;
 
-/// The average of every tensor of a model (running statistics too), with a decay that warms up with the step:
-/// min(decay, (1 + t) / (10 + t)).
+/// Exponential moving average of every tensor of a model (running statistics too), with a decay that warms up with the
+/// step: min(decay, (1 + t) / (10 + t)).
 #[derive(Clone, Debug)]
 pub struct Average<T: Float> {
     /// The share of the old average in the new one, once warm.

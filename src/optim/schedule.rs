@@ -2,20 +2,20 @@
 
 use serde::{Deserialize, Serialize};
 
-/// A factor on the learning rate, step by step.
+/// Learning-rate schedule: a factor on the rate for every step.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Schedule {
-    /// Steps over which the rate grows linearly from nothing.
+    /// Number of warm-up steps, over which the rate grows linearly from nothing.
     pub warm_up: u64,
-    /// What happens then.
+    /// Decay after the warm-up.
     pub decay: Decay,
 }
 
-/// How a learning rate falls.
+/// Decay of a learning rate.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "kind")]
 pub enum Decay {
-    /// Not at all.
+    /// No decay.
     Constant,
     /// By `factor`, once, from step `at` on.
     Step {

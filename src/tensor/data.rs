@@ -56,7 +56,7 @@ impl<T: Float> Tensor<T> {
         Tensor { shape, buffer: Arc::new(buffer) }
     }
 
-    /// Tensors of one shape `[n, ..]` one after the other, along the first dimension.
+    /// Concatenation of tensors of one shape `[n, ..]` along the first dimension.
     ///
     /// # Panics
     /// If there is none, if one is a scalar, or if their shapes differ.
@@ -70,13 +70,13 @@ impl<T: Float> Tensor<T> {
         })
     }
 
-    /// All elements `value`.
+    /// A tensor with all elements `value`.
     pub fn full(shape: impl Into<Shape>, value: T) -> Self {
         let shape = shape.into();
         Tensor { shape, buffer: Arc::new(Buffer::filled(shape.len(), value)) }
     }
 
-    /// All elements 0.
+    /// A tensor of zeros.
     pub fn zeros(shape: impl Into<Shape>) -> Self {
         Self::full(shape, T::ZERO)
     }
@@ -111,7 +111,7 @@ impl<T: Float> Tensor<T> {
         &self.buffer
     }
 
-    /// The elements, to be changed; shared memory is copied first.
+    /// The elements, mutable; shared memory is copied first.
     pub fn data_mut(&mut self) -> &mut [T] {
         let buffer: &mut Buffer<T> = Arc::make_mut(&mut self.buffer);
         buffer
@@ -157,7 +157,7 @@ impl<T: Float> Tensor<T> {
         self.buffer[index.iter().zip(self.shape.strides()).map(|(i, s)| i * s).sum::<usize>()]
     }
 
-    /// Each element through `f`.
+    /// A tensor with `f` applied to each element.
     pub fn map(&self, f: impl Fn(T) -> T) -> Self {
         Self::build(self.shape, |out| out.iter_mut().zip(self.data()).for_each(|(o, &x)| *o = f(x)))
     }

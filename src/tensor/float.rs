@@ -15,7 +15,7 @@ mod sealed {
     impl Sealed for f64 {}
 }
 
-/// `f32` or `f64`: what a tensor holds. Sealed, so that every kernel is checked for every type it runs in.
+/// Element type of a tensor: `f32` or `f64`. Sealed, so that every kernel is checked for every type it runs in.
 ///
 /// [`max`](Float::max) and [`min`](Float::min) propagate NaN, unlike the standard library's.
 pub trait Float:
@@ -164,8 +164,8 @@ impl Float for f32 {
         f32::mul_add(self, a, b)
     }
 
-    /// e^x = 2^n (1 + q), see [`reduced`]. 2^n is applied in two halves, which lets the result fall into the subnormals and
-    /// to 0 by itself.
+    /// e^x = 2^n (1 + q), see [`reduced`]. 2^n is applied in two halves, which lets the result fall into the subnormals
+    /// and to 0 by itself.
     #[inline(always)]
     fn exp(self) -> f32 {
         let (n, r, p) = reduced(self);
@@ -173,8 +173,8 @@ impl Float for f32 {
         let half = n >> 1;
         p * power_of_2(half) * power_of_2(n.wrapping_sub(half))
     }
-    /// With e^x = 2^n (1 + q) and n = h + k: 2^h (2^k q + (2^k - 2^-h)), where nothing overflows before the result does, and
-    /// n = 0 leaves q alone.
+    /// With e^x = 2^n (1 + q) and n = h + k: 2^h (2^k q + (2^k - 2^-h)), where nothing overflows before the result
+    /// does, and n = 0 leaves q alone.
     #[inline(always)]
     fn exp_m1(self) -> f32 {
         // From here on down it is -1.

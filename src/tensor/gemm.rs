@@ -17,7 +17,7 @@ pub enum Accum {
     Add,
 }
 
-/// A matrix in someone's memory: `rows` runs of `cols` elements, `row_stride` apart.
+/// Matrix view: `rows` runs of `cols` elements, `row_stride` apart.
 ///
 /// A range of channels of an image, one head of a token tensor, or a part of a concatenation is such a matrix where it
 /// lies.
@@ -33,7 +33,7 @@ pub struct Rows<'a, T> {
     pub row_stride: usize,
 }
 
-/// The same, to be written.
+/// Mutable matrix view.
 pub struct RowsMut<'a, T> {
     /// The memory, from the first element on.
     pub data: &'a mut [T],
@@ -107,7 +107,7 @@ impl<'a, T> RowsMut<'a, T> {
     }
 }
 
-/// A matrix as it enters a product: as it lies, or transposed.
+/// Operand of a matrix product: a matrix as it lies, or transposed.
 #[derive(Clone, Copy)]
 pub struct Operand<'a, T> {
     matrix: Rows<'a, T>,

@@ -28,7 +28,7 @@ impl<T: Float> Upstream<T> {
     }
 }
 
-/// Where a backward rule puts the gradients of its inputs.
+/// Destination of a backward rule: takes the gradients of the op's inputs.
 ///
 /// An input may appear twice (`f(x, x)`), and may already hold the gradient of another use: both ways in add up.
 pub struct GradSink<'a, T: Float> {
@@ -96,7 +96,7 @@ impl<T: Float> Gradients<T> {
         self.slots[leaf.slot_on(&self.tape)?].as_ref()
     }
 
-    /// The same, taken out.
+    /// Takes out the gradient of a leaf; `None` if the output does not depend on it.
     pub fn take(&mut self, leaf: &Var<T>) -> Option<Tensor<T>> {
         self.slots[leaf.slot_on(&self.tape)?].take()
     }

@@ -12,16 +12,17 @@ use std::time::{Duration, Instant};
 
 use super::{Float, Shape, Tensor, parallel};
 
-/// What one pass through an op has to do at the least.
+/// Least work of one pass of an op.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Work {
-    /// Multiplications and additions, counted as two; 0 where it is not a matter of arithmetic.
+    /// Floating-point operations, a multiplication and an addition counted as two; 0 where it is not a matter of
+    /// arithmetic.
     pub flops: u64,
     /// Bytes to be read and written if each is touched once.
     pub bytes: u64,
 }
 
-/// One op that ran.
+/// Profile of one op that ran.
 #[derive(Clone, Debug)]
 pub struct Entry {
     /// The op's name.
@@ -44,7 +45,7 @@ pub struct Entry {
     pub finite: bool,
 }
 
-/// Something that is no op.
+/// Profile of a named part of the work that is no op.
 #[derive(Clone, Copy, Debug)]
 pub struct Phase {
     /// What it is called.
@@ -53,7 +54,7 @@ pub struct Phase {
     pub time: Duration,
 }
 
-/// All that ran, and how long.
+/// Profile of a piece of work: its ops and other parts, with their times.
 #[derive(Clone, Debug, Default)]
 pub struct Profile {
     /// The ops, in the order of their forward passes.
@@ -89,7 +90,8 @@ pub fn record<R>(look_for_nan: bool, f: impl FnOnce() -> R) -> (R, Vec<Entry>) {
     (result, profile.ops)
 }
 
-/// Runs `f` and says which op first made a number that is not finite, if one did: its name, kernel path, place and shape.
+/// Runs `f` and says which op first made a number that is not finite, if one did: its name, kernel path, place and
+/// shape.
 pub fn first_not_finite<R>(f: impl FnOnce() -> R) -> Option<String> {
     let (_, entries) = record(true, f);
     let (i, e) = entries.iter().enumerate().find(|(_, e)| !e.finite)?;

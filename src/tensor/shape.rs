@@ -43,12 +43,12 @@ impl Shape {
         &self.dims[..self.rank as usize]
     }
 
-    /// How many dimensions there are.
+    /// Number of dimensions.
     pub fn rank(&self) -> usize {
         self.rank as usize
     }
 
-    /// How many elements there are: the product of the extents, 1 for a scalar.
+    /// Number of elements: the product of the extents, 1 for a scalar.
     pub fn len(&self) -> usize {
         self.dims().iter().product()
     }

@@ -32,7 +32,7 @@ struct Record<T: Float> {
     reversed: bool,
 }
 
-/// A record of a computation, to be reversed once.
+/// Tape: the record of a computation, which is differentiated in reverse once.
 ///
 /// ```
 /// use parallax::tensor::{Tape, Tensor};
@@ -62,7 +62,7 @@ impl<T: Float> Tape<T> {
         Tape(Rc::new(RefCell::new(Record { nodes: Vec::new(), shapes: Vec::new(), reversed: false })))
     }
 
-    /// A value whose gradient is wanted.
+    /// A leaf: a variable whose gradient is wanted.
     ///
     /// # Panics
     /// If the tape was already reversed.
@@ -80,7 +80,7 @@ impl<T: Float> Tape<T> {
         record.shapes.len() - 1
     }
 
-    /// How many ops are recorded.
+    /// Number of recorded ops.
     pub fn len(&self) -> usize {
         self.0.borrow().nodes.len()
     }

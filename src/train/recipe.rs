@@ -25,7 +25,7 @@ pub(super) fn steps_of(share: f64, steps: u64) -> u64 {
     (share * steps as f64).round() as u64
 }
 
-/// The settings of the optimiser.
+/// Settings of the optimiser.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OptimConfig {
@@ -54,15 +54,15 @@ pub struct OptimConfig {
 pub struct RateSchedule {
     /// The share of the steps over which the rates grow linearly from nothing.
     pub warm_up: f64,
-    /// The way they fall afterwards.
+    /// Decay after the warm-up.
     pub decay: RateDecay,
 }
 
-/// The way learning rates fall, in shares of the training's steps.
+/// Decay of the learning rates, in shares of the training's steps.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "kind", deny_unknown_fields)]
 pub enum RateDecay {
-    /// Not at all.
+    /// No decay.
     Constant,
     /// By `factor`, once, after the share `at` of the steps.
     Step {
