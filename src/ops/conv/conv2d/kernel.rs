@@ -4,7 +4,7 @@ use super::direct;
 use super::geometry::{Beyond, Geometry, Path};
 use super::parts::{Part, in_one_piece, whole};
 use crate::ops::support::epilogue::Finish;
-use crate::ops::support::put::begin_sum;
+use crate::ops::support::put::{begin_sum, put};
 use crate::ops::support::sums::sum_into;
 use crate::tensor::gemm::{Rows, RowsMut, gemm};
 use crate::tensor::pool::Buffer;
@@ -271,9 +271,7 @@ pub(in crate::ops) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, g: 
         let mut sum = Buffer::stale(patch * n);
         sum_into(&mut sum, Accum::Replace, &sums);
         for (k, row) in out.chunks_exact_mut(n).enumerate() {
-            for (o, s) in row.iter_mut().zip(sum[k..].iter().step_by(patch)) {
-                *o = if accum == Accum::Add { *o + *s } else { *s };
-            }
+            put(accum, row.iter_mut().zip(sum[k..].iter().step_by(patch).copied()));
         }
         return;
     }
