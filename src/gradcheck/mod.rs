@@ -20,6 +20,7 @@
 
 mod cases;
 mod differences;
+mod function;
 mod options;
 mod report;
 mod taylor;
@@ -33,31 +34,37 @@ pub use report::{InputReport, Outside, Report};
 pub use taylor::{taylor, taylor_slope};
 
 use crate::random::{Random, Stream};
-use crate::tensor::{Tape, Tensor, Var};
+use crate::tensor::{Tensor, Var};
+use function::{Function, OfVars};
 
 /// Compares the gradient of `f` at `inputs` with finite differences.
 ///
 /// `f` gets one [`Var`] per input and returns its outputs; untracked outputs are not differentiated. It is called many
 /// times, and must do the same every time. Nothing panics on a wrong gradient: the report says what is wrong.
 pub fn check(f: impl Fn(&[Var<f64>]) -> Vec<Var<f64>>, inputs: &[Tensor<f64>], options: &Options) -> Report {
-    let (outputs, tracked) = evaluate(&f, inputs, options);
-    if let Some(why) = unusable(&f, &outputs, inputs, options) {
+    check_function(&OfVars::new(f, &options.tracked(inputs.len())), inputs, options)
+}
+
+/// [`check`] of anything that has outputs and a backward pass.
+fn check_function(f: &dyn Function, inputs: &[Tensor<f64>], options: &Options) -> Report {
+    let outputs = f.recorded(inputs);
+    if let Some(why) = unusable(f, &outputs, inputs, options) {
         return Report::broken(why);
     }
     let cotangents: Vec<Vec<Option<Tensor<f64>>>> = match &options.cotangents {
-        Cotangents::Random => vec![cotangents(&outputs, options.seed)],
+        Cotangents::Random => vec![random_cotangents(&outputs, options.seed)],
         Cotangents::OneHot => one_hot(&outputs),
         Cotangents::Given(given) => match place(&outputs, given) {
             Ok(placed) => vec![placed],
             Err(why) => return Report::broken(why),
         },
     };
-    drop(outputs);
+    let tracked = options.tracked(inputs.len());
     let mut rows = Vec::new();
     for cotangents in cotangents {
-        let once = gradients_for(&f, inputs, options, &cotangents);
-        let twice = gradients_for(&f, inputs, options, &cotangents);
-        for (i, (a, b)) in once.inputs.iter().zip(&twice.inputs).enumerate() {
+        let once = f.pull(inputs, &cotangents);
+        let twice = f.pull(inputs, &cotangents);
+        for (i, (a, b)) in once.iter().zip(&twice).enumerate() {
             if let (Some(a), Some(b)) = (a, b)
                 && differs(a, b, options.nondeterminism)
             {
@@ -65,51 +72,35 @@ pub fn check(f: impl Fn(&[Var<f64>]) -> Vec<Var<f64>>, inputs: &[Tensor<f64>], o
                 return Report::broken(format!("the gradient of {name} differs from one run to the next"));
             }
         }
-        match differences(&f, inputs, &tracked, &cotangents, options) {
-            Ok(measured) => rows.push((once, measured)),
+        match differences::measure(f, inputs, &tracked, &cotangents, options) {
+            Ok(measured) => rows.push((Gradients { cotangents, inputs: once }, measured)),
             Err(why) => return Report::broken(why),
         }
     }
     Report::of_rows(&rows.iter().map(|(g, m)| (g, m)).collect::<Vec<_>>(), options)
 }
 
-/// Runs `f` on a tape of its own; and which inputs are tracked.
-fn evaluate(
-    f: impl Fn(&[Var<f64>]) -> Vec<Var<f64>>,
-    inputs: &[Tensor<f64>],
-    options: &Options,
-) -> (Vec<Var<f64>>, Vec<usize>) {
-    let tracked = options.tracked(inputs.len());
-    let tape = Tape::new();
-    let vars: Vec<_> = (0..inputs.len()).map(|i| leaf(&tape, &inputs[i], tracked.contains(&i))).collect();
-    (f(&vars), tracked)
-}
-
-fn leaf(tape: &Tape<f64>, value: &Tensor<f64>, tracked: bool) -> Var<f64> {
-    if tracked { tape.leaf(value.clone()) } else { Var::constant(value.clone()) }
-}
-
 /// Why a function cannot be checked at these inputs, if so.
 fn unusable(
-    f: impl Fn(&[Var<f64>]) -> Vec<Var<f64>>,
-    outputs: &[Var<f64>],
+    f: &dyn Function,
+    outputs: &[(Tensor<f64>, bool)],
     inputs: &[Tensor<f64>],
     options: &Options,
 ) -> Option<String> {
-    if !outputs.iter().any(Var::is_tracked) {
+    if !outputs.iter().any(|(_, tracked)| *tracked) {
         return Some("no output depends on any input by a recorded op".into());
     }
-    let again = evaluate(f, inputs, options).0;
-    let shapes = |outputs: &[Var<f64>]| outputs.iter().map(|y| *y.shape()).collect::<Vec<_>>();
+    let again = f.recorded(inputs);
+    let shapes = |outputs: &[(Tensor<f64>, bool)]| outputs.iter().map(|(y, _)| *y.shape()).collect::<Vec<_>>();
     if shapes(outputs) != shapes(&again) {
         let (first, second) = (shapes(outputs), shapes(&again));
         return Some(format!("the outputs have shapes {first:?}, and {second:?} when it is called again"));
     }
-    for (o, (y, z)) in outputs.iter().zip(&again).enumerate().filter(|(_, (y, _))| y.is_tracked()) {
-        if let Some(k) = y.value().data().iter().position(|y| y.is_nan()) {
+    for (o, ((y, _), (z, _))) in outputs.iter().zip(&again).enumerate().filter(|(_, ((_, tracked), _))| *tracked) {
+        if let Some(k) = y.data().iter().position(|y| y.is_nan()) {
             return Some(format!("output {o}, element {k} is NaN at these inputs: there is nothing to differentiate"));
         }
-        if differs(y.value(), z.value(), options.nondeterminism) {
+        if differs(y, z, options.nondeterminism) {
             return Some(format!("output {o} differs from one call to the next, on the same inputs"));
         }
     }
@@ -137,50 +128,34 @@ pub fn gradients(
     inputs: &[Tensor<f64>],
     options: &Options,
 ) -> Option<Gradients> {
-    let outputs = evaluate(&f, inputs, options).0;
-    let cotangents = cotangents(&outputs, options.seed);
-    outputs.iter().any(Var::is_tracked).then(|| gradients_for(f, inputs, options, &cotangents))
-}
-
-/// The gradients for given cotangents of the tracked outputs.
-fn gradients_for(
-    f: impl Fn(&[Var<f64>]) -> Vec<Var<f64>>,
-    inputs: &[Tensor<f64>],
-    options: &Options,
-    cotangents: &[Option<Tensor<f64>>],
-) -> Gradients {
     let tracked = options.tracked(inputs.len());
-    let tape = Tape::new();
-    let vars: Vec<_> = (0..inputs.len()).map(|i| leaf(&tape, &inputs[i], tracked.contains(&i))).collect();
-    let outputs = f(&vars);
-    let seeds: Vec<_> = outputs.iter().zip(cotangents).filter_map(|(y, c)| Some((y, c.clone()?))).collect();
-    let mut all = tape.backward(&seeds);
-    let mut take = |i: usize| all.take(&vars[i]).unwrap_or_else(|| Tensor::zeros(*inputs[i].shape()));
-    let inputs = (0..inputs.len()).map(|i| tracked.contains(&i).then(|| take(i))).collect();
-    Gradients { cotangents: cotangents.to_vec(), inputs }
+    let f = OfVars::new(f, &tracked);
+    let outputs = f.recorded(inputs);
+    let cotangents = random_cotangents(&outputs, options.seed);
+    let any = outputs.iter().any(|(_, tracked)| *tracked);
+    any.then(|| Gradients { inputs: f.pull(inputs, &cotangents), cotangents })
 }
 
 /// A random cotangent for every tracked output: of magnitude 0.5 to 1.5, of either sign, so that no element is lost.
 pub fn cotangents(outputs: &[Var<f64>], seed: u64) -> Vec<Option<Tensor<f64>>> {
+    let outputs: Vec<_> = outputs.iter().map(|y| (y.value().clone(), y.is_tracked())).collect();
+    random_cotangents(&outputs, seed)
+}
+
+/// [`cotangents`] of outputs, each with whether it is differentiated.
+fn random_cotangents(outputs: &[(Tensor<f64>, bool)], seed: u64) -> Vec<Option<Tensor<f64>>> {
     let mut random = Random::of(seed, Stream::Cotangents);
-    outputs
-        .iter()
-        .map(|y| {
-            y.is_tracked().then(|| {
-                Tensor::build(*y.shape(), |out| {
-                    out.iter_mut().for_each(|c| *c = random.uniform(0.5, 1.5) * if random.coin() { 1.0 } else { -1.0 })
-                })
-            })
-        })
-        .collect()
+    let mut draw = |_| random.uniform(0.5, 1.5) * if random.coin() { 1.0 } else { -1.0 };
+    let mut fill = |y: &Tensor<f64>| Tensor::from_vec(*y.shape(), (0..y.len()).map(&mut draw).collect());
+    outputs.iter().map(|(y, tracked)| tracked.then(|| fill(y))).collect()
 }
 
 /// For every element of every tracked output: 1 there, 0 elsewhere.
-fn one_hot(outputs: &[Var<f64>]) -> Vec<Vec<Option<Tensor<f64>>>> {
-    let zeros: Vec<_> = outputs.iter().map(|y| y.is_tracked().then(|| Tensor::zeros(*y.shape()))).collect();
+fn one_hot(outputs: &[(Tensor<f64>, bool)]) -> Vec<Vec<Option<Tensor<f64>>>> {
+    let zeros: Vec<_> = outputs.iter().map(|(y, tracked)| tracked.then(|| Tensor::zeros(*y.shape()))).collect();
     let mut all = Vec::new();
-    for (o, y) in outputs.iter().enumerate().filter(|(_, y)| y.is_tracked()) {
-        for k in 0..y.value().len() {
+    for (o, (y, _)) in outputs.iter().enumerate().filter(|(_, (_, tracked))| *tracked) {
+        for k in 0..y.len() {
             let mut hot = zeros.clone();
             hot[o].as_mut().expect("tracked").data_mut()[k] = 1.0;
             all.push(hot);
@@ -190,12 +165,12 @@ fn one_hot(outputs: &[Var<f64>]) -> Vec<Vec<Option<Tensor<f64>>>> {
 }
 
 /// Given cotangents, beside the outputs that they belong to.
-fn place(outputs: &[Var<f64>], given: &[Tensor<f64>]) -> Result<Vec<Option<Tensor<f64>>>, String> {
-    let shapes: Vec<_> = outputs.iter().filter(|y| y.is_tracked()).map(|y| *y.shape()).collect();
+fn place(outputs: &[(Tensor<f64>, bool)], given: &[Tensor<f64>]) -> Result<Vec<Option<Tensor<f64>>>, String> {
+    let shapes: Vec<_> = outputs.iter().filter(|(_, tracked)| *tracked).map(|(y, _)| *y.shape()).collect();
     let found: Vec<_> = given.iter().map(|c| *c.shape()).collect();
     if shapes != found {
         return Err(format!("cotangents of shapes {found:?} were given for outputs of shapes {shapes:?}"));
     }
     let mut given = given.iter().cloned();
-    Ok(outputs.iter().map(|y| y.is_tracked().then(|| given.next()).flatten()).collect())
+    Ok(outputs.iter().map(|(_, tracked)| tracked.then(|| given.next()).flatten()).collect())
 }
