@@ -168,7 +168,10 @@ fn what_is_planted_is_found() {
 }
 
 /// The exponent of the relative error; how many must be found with it in every element, and in one.
-const LEAST: [(i32, usize, usize); 6] = [(-1, 0, 0), (-2, 0, 0), (-3, 0, 0), (-4, 0, 0), (-5, 0, 0), (-6, 0, 0)];
+/// A single step of 6e-6 finds 134, 132, 130, 130, 130, 130 and 133, 132, 128, 126, 121, 112: no more than it judges right
+/// without.
+const LEAST: [(i32, usize, usize); 6] =
+    [(-1, 150, 150), (-2, 148, 148), (-3, 148, 145), (-4, 146, 142), (-5, 143, 131), (-6, 140, 120)];
 
 #[track_caller]
 fn assert_right(numbers: &[f64], f: impl Fn(&V) -> V) {

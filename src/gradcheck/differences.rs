@@ -310,7 +310,7 @@ impl<'a> Prober<'a> {
         let shortest = (self.epsilon.powf(0.6) * large).min(1e-5 * small);
         let mut steps = Vec::new();
         let mut h = longest;
-        while h > shortest && h > 1e7 * self.epsilon * small && steps.len() < MOST_STEPS {
+        while h > shortest && h > self.epsilon.powf(0.55) * small && steps.len() < MOST_STEPS {
             let step = self.step(movement, h);
             steps.push(step);
             h /= 4.0;

@@ -1,10 +1,20 @@
-//! The gradient checker: analytic gradients against finite differences in f64, for any function of [`Var`]s.
+//! The gradient checker: analytic gradients against finite differences, for any function of [`Var`]s and for plain
+//! closures.
 //!
 //! The cotangent is random, never ones: a sum as the loss would hide every error that cancels in it (softmax and the
 //! normalisations would have nothing left to check). Outputs are differenced *before* they meet the cotangent. The error
-//! of an input is max |analytic - numeric| / max |analytic| over its elements. Where the one-sided differences disagree
-//! there is a kink: the analytic value must lie between the one-sided ones, the gradients of elements that tie must add
-//! up to what they have together, and a check must say how many kinks it expects.
+//! of an input is max |analytic - numeric| / max |analytic| over its elements.
+//!
+//! Every difference is taken with two steps at least, and with a ladder of steps where those disagree, so that it knows
+//! how far it may be off. A report tells apart
+//!
+//! - **wrong**: analytic and numeric are further apart than the tolerance and what the difference may be off;
+//! - **at a kink**: the one-sided differences disagree however short the step. The analytic value must lie between them,
+//!   the gradients of elements that tie must add up to what they have together, and a check must say how many kinks it
+//!   expects;
+//! - **cannot be decided**: no step is short enough for how the function bends and long enough for how it rounds;
+//! - and, as [warnings](Report::warnings) of a right gradient: derivatives that rounding blurs, derivatives too small
+//!   beside the largest for the tolerance to see, inputs that are stationary here.
 //!
 //! ```
 //! use parallax::gradcheck::{check, Options};
@@ -14,15 +24,85 @@
 //! assert!(report.failure().is_none(), "{report}");
 //! ```
 //!
+//! # Which function to call
+//!
+//! | what you have | call |
+//! |---|---|
+//! | a function of `Var<f64>`, of `Var<f32>` | [`check`], [`check_f32`] |
+//! | an op of your own, with cases | [`check_op`]: all that the ops of this crate are held to |
+//! | a model and its loss | [`check_params`] |
+//! | a closure over plain numbers, of any library | [`check_fn`] |
+//! | second derivatives | [`hvp`], [`check_hvp`] |
+//!
 //! [`check`] is three steps that can be had one by one: [`gradients`] (by the backward pass), [`differences()`] (by
 //! moving one number after the other) and [`Report::new`] (what the two have to do with each other). [`taylor`] needs no
 //! step at all.
+//!
+//! # Check your own op, of any library
+//!
+//! A function and its vector-Jacobian product over plain slices are enough. The gradient of x sin(x), by hand:
+//!
+//! ```
+//! use parallax::gradcheck::{check_fn, Options};
+//! let f = |x: &[f64]| {
+//!     let x = x.to_vec();
+//!     let y: Vec<f64> = x.iter().map(|x| x * x.sin()).collect();
+//!     let vjp = move |g: &[f64]| -> Vec<f64> {
+//!         x.iter().zip(g).map(|(x, g)| g * (x.sin() + x * x.cos())).collect()
+//!     };
+//!     (y, vjp)
+//! };
+//! let report = check_fn(f, &[0.3, -1.2, 2.0], &Options::default());
+//! assert!(report.failure().is_none(), "{report}");
+//! ```
+//!
+//! A custom op of candle, whose loss with the cotangent is a product and a sum (a sketch; in f64 on the CPU):
+//!
+//! ```ignore
+//! let f = |x: &[f64]| {
+//!     let x = Var::from_slice(x, x.len(), &Device::Cpu).unwrap();
+//!     let y = x.apply_op1(MyOp).unwrap();
+//!     let numbers: Vec<f64> = y.to_vec1().unwrap();
+//!     (numbers, move |g: &[f64]| {
+//!         let g = Tensor::from_slice(g, g.len(), &Device::Cpu).unwrap();
+//!         let gradients = (&y * g).unwrap().sum_all().unwrap().backward().unwrap();
+//!         gradients.get(&x).unwrap().to_vec1().unwrap()
+//!     })
+//! };
+//! check_fn(f, &numbers, &Options::default());
+//! ```
+//!
+//! The same for burn, with a backend that computes in f32 (a sketch):
+//!
+//! ```ignore
+//! type B = Autodiff<NdArray<f32>>;
+//! let f = |x: &[f64]| {
+//!     let x = Tensor::<B, 1>::from_data(TensorData::from(x).convert::<f32>(), &device).require_grad();
+//!     let y = my_op(x.clone());
+//!     let numbers: Vec<f64> = y.to_data().convert::<f64>().to_vec().unwrap();
+//!     (numbers, move |g: &[f64]| {
+//!         let g = Tensor::<B, 1>::from_data(TensorData::from(g).convert::<f32>(), &device);
+//!         let gradients = (y.clone() * g).sum().backward();
+//!         x.grad(&gradients).unwrap().into_data().convert::<f64>().to_vec().unwrap()
+//!     })
+//! };
+//! check_fn(f, &numbers, &Options::single());
+//! ```
+//!
+//! # What is not there
+//!
+//! Derivatives in forward mode, complex numbers, sparse tensors, and second derivatives by a backward pass through the
+//! backward pass: [`hvp`] takes differences of gradients.
 
 mod cases;
 mod differences;
 mod function;
 mod options;
+mod params;
+mod plain;
 mod report;
+mod second;
+mod suite;
 mod taylor;
 #[cfg(test)]
 mod tests;
@@ -30,7 +110,11 @@ mod tests;
 pub use cases::{CaseReport, check_case, draw, options_of};
 pub use differences::{Differences, Measured, Quotient, Tie, differences};
 pub use options::{Cotangents, Kinks, Options, Stencil, Tolerance};
+pub use params::check_params;
+pub use plain::{Numbers, check_fn};
 pub use report::{InputReport, Outside, Report};
+pub use second::{Hvp, check_hvp, hvp};
+pub use suite::{CHECKS, Check, Complaint, OpReport, Subject, check_op};
 pub use taylor::{taylor, taylor_slope};
 
 use crate::random::{Random, Stream};
@@ -43,6 +127,23 @@ use function::{Function, OfVars};
 /// times, and must do the same every time. Nothing panics on a wrong gradient: the report says what is wrong.
 pub fn check(f: impl Fn(&[Var<f64>]) -> Vec<Var<f64>>, inputs: &[Tensor<f64>], options: &Options) -> Report {
     check_function(&OfVars::new(f, &options.tracked(inputs.len())), inputs, options)
+}
+
+/// [`check`] of a function that computes in f32, with options that follow from [`Options::single`].
+///
+/// The differences are taken of what the function computes in f32, so that they are known to three digits or so: errors
+/// below a thousandth are not seen. A function that is generic over the element type is better checked in f64.
+///
+/// ```
+/// use parallax::gradcheck::{check_f32, Options};
+/// use parallax::tensor::Tensor;
+/// let x = Tensor::from_vec([3], vec![0.5f32, -1.0, 2.0]);
+/// let report = check_f32(|v| vec![(&v[0] * &v[0]).sigmoid()], &[x], &Options::single());
+/// assert!(report.failure().is_none(), "{report}");
+/// ```
+pub fn check_f32(f: impl Fn(&[Var<f32>]) -> Vec<Var<f32>>, inputs: &[Tensor<f32>], options: &Options) -> Report {
+    let inputs: Vec<Tensor<f64>> = inputs.iter().map(Tensor::cast).collect();
+    check_function(&OfVars::new(f, &options.tracked(inputs.len())), &inputs, options)
 }
 
 /// [`check`] of anything that has outputs and a backward pass.
