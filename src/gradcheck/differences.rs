@@ -53,6 +53,8 @@ struct Step {
     high: f64,
     /// What rounding alone may do to a quotient.
     noise: f64,
+    /// The sum of the outputs' sizes, met with the cotangents.
+    outputs: f64,
     moves: bool,
 }
 
@@ -273,6 +275,7 @@ impl<'a> Prober<'a> {
         });
         // The inputs are rounded as well, where several move; and so is what the outputs are computed from.
         let moved = if movement.len() > 1 { self.sizes(movement)[0] * s.size() } else { 0.0 };
+        s.outputs = size;
         s.noise = (self.epsilon * (size + moved) + self.jitter) / h;
         s
     }
@@ -297,8 +300,13 @@ impl<'a> Prober<'a> {
         (self.quotient(&last, central, error + 2.0 * last.noise, movement), doubtful)
     }
 
+    /// The error that rounding is good for, where outputs are of a size.
+    fn rounding(&self, size: f64, movement: &[(usize, usize, f64)]) -> f64 {
+        250.0 * self.epsilon.powf(2.0 / 3.0) * size / self.sizes(movement)[0]
+    }
+
     fn quotient(&self, s: &Step, central: f64, error: f64, movement: &[(usize, usize, f64)]) -> Quotient {
-        let rounding = 250.0 * self.epsilon.powf(2.0 / 3.0) * self.size / self.sizes(movement)[0];
+        let rounding = self.rounding(self.size, movement);
         let Step { left, right, low, high, moves, .. } = *s;
         Quotient { central, error, left, right, low, high, rounding, kink: false, moves }
     }
@@ -323,13 +331,19 @@ impl<'a> Prober<'a> {
             let [central, error] = extrapolate(w);
             (central, error + 2.0 * last.noise, last)
         });
-        let best = extrapolated.min_by(|a, b| a.1.total_cmp(&b.1));
-        let Some((central, error, last)) = best else {
+        let mut all: Vec<_> = extrapolated.collect();
+        all.sort_by(|a, b| a.1.total_cmp(&b.1));
+        let Some(&(central, error, last)) = all.first() else {
             // Beyond one of the sides there is nothing, however short the step.
             let s = self.step(movement, self.usual(movement));
             return self.quotient(&s, s.central, f64::INFINITY, movement);
         };
+        // The best of many is better than it is by chance: the runners-up say by how much.
+        let error = all.iter().take(3).fold(error, |m, other| m.max((other.0 - central).abs()));
         let mut q = self.quotient(last, central, error, movement);
+        // Where outputs vanish here, what rounds is their size along the way.
+        let size = steps.iter().fold(self.size, |m, s| m.max(s.outputs));
+        q.rounding = self.rounding(size, movement);
         if let Some(at) = self.kink(&steps, scale) {
             q = self.quotient(at, at.central, at.noise, movement);
             q.kink = true;
