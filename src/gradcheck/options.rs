@@ -29,6 +29,8 @@ pub struct Options {
     pub names: Vec<String>,
     /// The seed of cotangents and directions.
     pub seed: u64,
+    /// Whether a plain function computes in f32; variables know it themselves.
+    pub single: bool,
 }
 
 impl Default for Options {
@@ -46,6 +48,7 @@ impl Default for Options {
             nondeterminism: 0.0,
             names: vec![],
             seed: 0,
+            single: false,
         }
     }
 }
@@ -54,6 +57,12 @@ impl Options {
     /// Five points and a longer step: an error of the fourth power of the step, for functions that bend much.
     pub fn five_point() -> Self {
         Options { step: 5e-4, stencil: Stencil::FivePoint, ..Self::default() }
+    }
+
+    /// For functions that compute in f32, where a difference quotient has three digits: the cube root of the type's
+    /// epsilon as the step, a tolerance of a thousandth.
+    pub fn single() -> Self {
+        Options { step: 5e-3, tolerance: Tolerance::OfLargest(1e-3), single: true, ..Self::default() }
     }
 
     /// The inputs that are differentiated, out of `count`.

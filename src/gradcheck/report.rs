@@ -22,14 +22,24 @@ pub struct InputReport {
     pub analytic: f64,
     /// The numeric derivative there.
     pub numeric: f64,
+    /// How far that may be off, as the differences say themselves.
+    pub uncertainty: f64,
     /// The largest analytic derivative.
     pub scale: f64,
     /// Derivatives compared.
     pub elements: usize,
     /// Elements at a kink: they are held between their one-sided derivatives, and in sum where they tie.
     pub kinks: Vec<usize>,
-    /// Whether every difference is within the tolerance.
+    /// Whether every difference is within the tolerance, as far as differences can say.
     pub within: bool,
+    /// Whether the worst element is left open: the two are apart by no more than the differences may be off.
+    pub undecided: bool,
+    /// Derivatives that are known less exactly than the tolerance asks for.
+    pub blunt: usize,
+    /// Derivatives that are smaller than what is allowed for them: they could be anything of their size and pass.
+    pub unseen: usize,
+    /// The first of those that the differences contradict nevertheless: element, analytic, numeric.
+    pub contradicted: Option<(usize, f64, f64)>,
     /// An element at a kink whose analytic value is none of its one-sided ones, nor between them.
     pub outside: Option<Outside>,
 }
@@ -67,17 +77,22 @@ impl InputReport {
             worst: 0,
             analytic: 0.0,
             numeric: 0.0,
+            uncertainty: 0.0,
             scale,
             elements: 0,
             kinks: vec![],
             within: true,
+            undecided: false,
+            blunt: 0,
+            unseen: 0,
+            contradicted: None,
             outside: None,
         };
         let mut share = 0.0;
         for (row, (analytic, (_, differences))) in analytic.iter().zip(rows).enumerate() {
             for (k, (&a, q)) in analytic.iter().zip(&differences.quotients).enumerate() {
                 r.elements += 1;
-                if q.is_kink(size) {
+                if q.is_kink() {
                     if !r.kinks.contains(&k) {
                         r.kinks.push(k);
                     }
@@ -89,10 +104,28 @@ impl InputReport {
                     }
                     continue;
                 }
-                let apart = (a - q.central).abs();
-                let part = apart / options.tolerance.allowed(q.central, scale);
-                if part.is_nan() || part > share {
+                let (apart, allowed) = ((a - q.central).abs(), options.tolerance.allowed(q.central, scale));
+                let known = |apart: f64| apart > ROOM * q.error;
+                let largest = a.abs().max(q.central.abs());
+                if known(q.central.abs()) && largest <= allowed {
+                    r.unseen += 1;
+                    if r.contradicted.is_none() && known(apart) && apart > 1e-2 * largest {
+                        r.contradicted = Some((k, a, q.central));
+                    }
+                }
+                let mut part = apart / allowed;
+                let mut undecided = false;
+                if part > 1.0 && apart <= allowed + ROOM * q.error {
+                    // Either three digits are known, or rounding leaves no more to be known.
+                    if q.error <= 1e-3 * scale || q.error <= q.rounding {
+                        (part, r.blunt) = (1.0, r.blunt + 1);
+                    } else {
+                        undecided = true;
+                    }
+                }
+                if part.is_nan() || part > share && !share.is_nan() {
                     (share, r.worst, r.analytic, r.numeric) = (part, k, a, q.central);
+                    (r.uncertainty, r.undecided) = (q.error, undecided);
                     r.error = apart / if scale > 0.0 { scale } else { 1.0 };
                     r.within &= part <= 1.0;
                 }
@@ -102,6 +135,8 @@ impl InputReport {
     }
 }
 
+/// Analytic and numeric derivatives may be apart by so many times what the differences say that they may be off.
+const ROOM: f64 = 4.0;
 /// What a check found.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
@@ -109,6 +144,8 @@ pub struct Report {
     pub inputs: Vec<Option<InputReport>>,
     /// Groups of tied elements whose derivatives were compared in sum.
     pub ties: usize,
+    /// What is not wrong, but was not seen clearly either: each a sentence.
+    pub warnings: Vec<String>,
     failure: Option<String>,
 }
 
@@ -132,14 +169,15 @@ impl Report {
         };
         let inputs: Vec<_> = (0..count).map(input).collect();
         let ties = rows.iter().map(|(_, m)| m.ties.len()).sum();
-        let mut report = Report { inputs, ties, failure: None };
+        let mut report = Report { inputs, ties, warnings: vec![], failure: None };
+        report.warnings = report.warn(options);
         report.failure = report.judge(rows, options);
         report
     }
 
     /// A report that says only why nothing could be compared.
     pub(super) fn broken(why: impl Into<String>) -> Self {
-        Report { inputs: vec![], ties: 0, failure: Some(why.into()) }
+        Report { inputs: vec![], ties: 0, warnings: vec![], failure: Some(why.into()) }
     }
 
     /// The largest error of any input.
@@ -162,6 +200,30 @@ impl Report {
         self.failure.as_deref()
     }
 
+    fn warn(&self, options: &Options) -> Vec<String> {
+        let mut all = Vec::new();
+        for (i, r) in self.inputs.iter().enumerate().filter_map(|(i, r)| Some((i, r.as_ref()?))) {
+            let name = &r.name;
+            if r.blunt > 0 {
+                all.push(format!("{name}: {} derivatives are known less exactly than the tolerance asks for", r.blunt));
+            }
+            if r.unseen > 0 && r.scale > 0.0 {
+                let what = r.contradicted.map_or_else(String::new, |(k, analytic, numeric)| {
+                    format!(": element {k} has analytic {analytic:e}, numeric {numeric:e}")
+                });
+                all.push(format!(
+                    "{name}: {} derivatives are smaller than what the tolerance allows beside the largest, {:e}; \
+                     `Tolerance::Elementwise` would compare them{what}",
+                    r.unseen, r.scale
+                ));
+            }
+            if r.scale == 0.0 && r.elements > 0 && !options.flat && !options.ignored.contains(&i) {
+                all.push(format!("{name}: every derivative is zero here; another point would show more"));
+            }
+        }
+        all
+    }
+
     fn judge(&self, rows: &[(&Gradients, &Measured)], options: &Options) -> Option<String> {
         let inputs = || self.inputs.iter().enumerate().filter_map(|(i, r)| Some((i, r.as_ref()?)));
         if inputs().all(|(_, r)| r.elements == 0) && !options.flat {
@@ -169,6 +231,19 @@ impl Report {
         }
         for (_, r) in inputs() {
             let name = &r.name;
+            if !r.within && r.numeric.is_nan() && !r.analytic.is_nan() {
+                return Some(format!(
+                    "{name}, element {}: analytic {:e}, and no number on one of its sides: not inside the domain",
+                    r.worst, r.analytic,
+                ));
+            }
+            if !r.within && r.undecided {
+                return Some(format!(
+                    "{name}, element {}, cannot be decided: analytic {:e}, numeric {:e} give or take {:.1e}: every step is \
+                     too long for how the function bends, or too short for how it rounds",
+                    r.worst, r.analytic, r.numeric, r.uncertainty,
+                ));
+            }
             if !r.within {
                 return Some(format!(
                     "{name}, {} {}: analytic {:e}, numeric {:e}: {:.1e} apart, {:.1e} of the largest",
@@ -195,7 +270,7 @@ impl Report {
                 let scale = tie.members.iter().map(gradient).fold(expected.abs(), |m, g| m.max(g.abs()));
                 let apart = (sum - expected).abs();
                 // NaN is not within anything.
-                if apart.is_nan() || apart > options.tolerance.allowed(expected, scale) {
+                if apart.is_nan() || apart > options.tolerance.allowed(expected, scale) + ROOM * tie.quotient.error {
                     let members = &tie.members;
                     return Some(format!(
                         "the tied elements {members:?} (input, element) have derivatives that sum to {sum:e}; together \
@@ -211,14 +286,15 @@ impl Report {
             return Some(format!("{} elements at a kink, {declared} were declared: {at:?}", self.kinks()));
         }
         let mut zero = inputs().filter(|(_, r)| r.scale == 0.0).peekable();
+        let moves = |i: usize| rows.iter().any(|(_, m)| m.moves[i]);
         if options.flat {
             let count = inputs().count();
             return (zero.count() < count).then(|| "a gradient is not zero, though declared flat".into());
         }
-        if inputs().all(|(_, r)| r.scale == 0.0) {
+        if inputs().all(|(i, r)| r.scale == 0.0 && !moves(i)) {
             return Some("every gradient is zero: nothing was checked".into());
         }
-        let ignored = zero.find(|(i, r)| r.elements > 0 && !options.ignored.contains(i));
+        let ignored = zero.find(|(i, r)| r.elements > 0 && !options.ignored.contains(i) && !moves(*i));
         ignored.map(|(_, r)| {
             format!("{}: every derivative is zero: the function ignores it; declare it so if that is right", r.name)
         })
@@ -248,6 +324,9 @@ impl fmt::Display for Report {
                 r.numeric,
                 r.error
             )?;
+        }
+        for warning in &self.warnings {
+            writeln!(f, "note: {warning}")?;
         }
         match &self.failure {
             Some(why) => write!(f, "WRONG: {why}"),

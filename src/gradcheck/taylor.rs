@@ -1,6 +1,7 @@
 //! The Taylor test: is a gradient right along a direction, without choosing a step?
 
-use super::{Options, evaluate, gradients};
+use super::function::{Function, OfVars};
+use super::{Options, gradients};
 use crate::random::{Random, Stream};
 use crate::tensor::{Tensor, Var};
 
@@ -42,6 +43,7 @@ pub fn taylor(
     options: &Options,
     steps: [f64; 2],
 ) -> Option<f64> {
+    let tracked = options.tracked(inputs.len());
     let found = gradients(&f, inputs, options)?;
     let mut random = Random::of(options.seed, Stream::TaylorDirections);
     let mut draw = |x: &Tensor<f64>| Tensor::build(*x.shape(), |d| d.iter_mut().for_each(|d| *d = random.normal()));
@@ -56,8 +58,8 @@ pub fn taylor(
                 x.data_mut().iter_mut().zip(d.data()).for_each(|(x, d)| *x += h * d);
             }
         }
-        let outputs = evaluate(&f, &moved, options).0;
-        outputs.iter().zip(&found.cotangents).filter_map(|(y, c)| Some(dot(y.value(), c.as_ref()?))).sum()
+        let outputs = OfVars::new(&f, &tracked).recorded(&moved);
+        outputs.iter().zip(&found.cotangents).filter_map(|((y, _), c)| Some(dot(y, c.as_ref()?))).sum()
     };
     Some(taylor_slope(at, derivative, steps))
 }

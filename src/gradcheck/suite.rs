@@ -1,0 +1,369 @@
+//! What every case of an op must pass: a list of named checks, for the ops of this crate and for those from elsewhere.
+
+use std::cell::OnceCell;
+use std::fmt;
+use std::sync::{Mutex, PoisonError};
+
+use serde::Serialize;
+
+use super::{Gradients, Measured, Options, Report, cotangents, differences, draw, options_of};
+use crate::ops::Op;
+use crate::ops::case::Fill;
+use crate::ops::registry::{AnyCase, Entry};
+use crate::tensor::{Tape, Tensor, Var, parallel, pool};
+
+/// Outputs, and the gradients of the tracked inputs.
+type Outcome = (Vec<Tensor<f64>>, Vec<Option<Tensor<f64>>>);
+
+/// The seed of inputs and cotangents.
+const SEED: u64 = 1;
+
+/// A case with its inputs, and what is known of it so far.
+pub struct Subject<'a> {
+    /// The case.
+    pub case: &'a dyn AnyCase,
+    /// Its inputs, as they were drawn.
+    pub inputs: Vec<Tensor<f64>>,
+    /// What it says of its own check.
+    pub options: Options,
+    /// Which inputs are differentiated.
+    pub all: Vec<bool>,
+    measured: OnceCell<Measured>,
+    first: OnceCell<Outcome>,
+}
+
+impl<'a> Subject<'a> {
+    /// A case with inputs of its own.
+    pub fn new(case: &'a dyn AnyCase) -> Self {
+        let options = options_of(case, SEED);
+        let all = (0..case.inputs().len()).map(|i| !options.constant.contains(&i)).collect();
+        let inputs = draw(case, SEED);
+        Subject { case, inputs, options, all, measured: OnceCell::new(), first: OnceCell::new() }
+    }
+
+    /// The same inputs to another op with the same forward pass, whose finite differences are known therefore.
+    pub fn altered<'b>(&self, case: &'b dyn AnyCase) -> Subject<'b> {
+        let measured = OnceCell::from(self.measured().clone());
+        let (inputs, options, all) = (self.inputs.clone(), self.options.clone(), self.all.clone());
+        Subject { case, inputs, options, all, measured, first: OnceCell::new() }
+    }
+
+    /// What it is called in messages.
+    pub fn what(&self) -> String {
+        format!("{} [{}] \"{}\"", self.case.op(), self.case.algo(), self.case.name())
+    }
+
+    fn run(&self, vars: &[Var<f64>]) -> Vec<Var<f64>> {
+        self.case.run(&vars.iter().collect::<Vec<_>>())
+    }
+
+    /// The op's outputs and gradients, the first time.
+    pub fn first(&self) -> &Outcome {
+        self.first.get_or_init(|| outcome(self.case, &self.inputs, &self.all))
+    }
+
+    /// The finite differences.
+    pub fn measured(&self) -> &Measured {
+        self.measured.get_or_init(|| {
+            let tracked: Vec<usize> = (0..self.inputs.len()).filter(|&i| self.all[i]).collect();
+            let cotangents = self.gradients().cotangents;
+            let measured = differences(|v| self.run(v), &self.inputs, &tracked, &cotangents, &self.options);
+            measured.unwrap_or_else(|why| panic!("{}: {why}", self.what()))
+        })
+    }
+
+    /// The gradients as the checker takes them.
+    pub fn gradients(&self) -> Gradients {
+        let vars = leaves(&Tape::new(), &self.inputs, &self.all);
+        let cotangents = cotangents(&self.run(&vars), SEED);
+        let zero = |(i, g): (usize, &Option<Tensor<f64>>)| {
+            self.all[i].then(|| g.clone().unwrap_or_else(|| Tensor::zeros(*self.inputs[i].shape())))
+        };
+        Gradients { cotangents, inputs: self.first().1.iter().enumerate().map(zero).collect() }
+    }
+
+    /// The comparison of gradients and differences.
+    pub fn report(&self) -> Report {
+        Report::new(&self.gradients(), self.measured(), &self.options)
+    }
+}
+
+fn leaves(tape: &Tape<f64>, inputs: &[Tensor<f64>], tracked: &[bool]) -> Vec<Var<f64>> {
+    let leaf = |(x, &on): (&Tensor<f64>, &bool)| if on { tape.leaf(x.clone()) } else { Var::constant(x.clone()) };
+    inputs.iter().zip(tracked).map(leaf).collect()
+}
+
+fn outcome(case: &dyn AnyCase, inputs: &[Tensor<f64>], tracked: &[bool]) -> Outcome {
+    let tape = Tape::new();
+    let vars = leaves(&tape, inputs, tracked);
+    let outputs = case.run(&vars.iter().collect::<Vec<_>>());
+    let cotangents = cotangents(&outputs, SEED);
+    let seeds: Vec<_> = outputs.iter().zip(cotangents).filter_map(|(y, c)| Some((y, c?))).collect();
+    let mut gradients = tape.backward(&seeds);
+    let gradients = vars.iter().map(|v| gradients.take(v)).collect();
+    (outputs.into_iter().map(Var::into_value).collect(), gradients)
+}
+
+fn same(a: &Outcome, b: &Outcome) -> Result<(), String> {
+    for (i, (x, y)) in a.0.iter().zip(&b.0).enumerate() {
+        if !x.same_bits(y) {
+            return Err(format!("output {i} differs"));
+        }
+    }
+    for (i, (x, y)) in a.1.iter().zip(&b.1).enumerate() {
+        if let (Some(x), Some(y)) = (x, y)
+            && !x.same_bits(y)
+        {
+            return Err(format!("the gradient of input {i} differs"));
+        }
+    }
+    Ok(())
+}
+
+/// A check: what is wrong, if anything is.
+pub type Check = fn(&Subject) -> Result<(), String>;
+
+/// All of them.
+pub const CHECKS: [(&str, Check); 9] = [
+    ("differences", against_differences),
+    ("promises", keeps_its_promise),
+    ("accumulation", adds_to_what_is_there),
+    ("repetition", adds_up_over_several_places),
+    ("subsets", is_the_same_for_every_subset_of_tracked_inputs),
+    ("again", is_the_same_again),
+    ("threads", is_the_same_on_one_and_two_threads),
+    ("poison", is_the_same_over_poisoned_memory),
+    ("single", is_nearly_the_same_in_single_precision),
+];
+
+/// Analytic gradients against finite differences; at kinks between the one-sided ones, at ties in sum.
+fn against_differences(s: &Subject) -> Result<(), String> {
+    s.report().failure().map_or(Ok(()), |why| Err(why.to_string()))
+}
+
+/// The gradient that the case states, but for rounding.
+fn keeps_its_promise(s: &Subject) -> Result<(), String> {
+    let Some((input, promised)) = s.case.promise() else { return Ok(()) };
+    let tape = Tape::new();
+    let vars = leaves(&tape, &s.inputs, &s.all);
+    let outputs = s.run(&vars);
+    let tracked = outputs.iter().filter(|y| y.is_tracked());
+    let seeds: Vec<_> = tracked.map(|y| (y, Tensor::full(*y.shape(), 1.0))).collect();
+    let found = tape.backward(&seeds).take(&vars[input]);
+    let found = found.as_ref().map_or(&[][..], Tensor::data);
+    let close = |(a, b): (&f64, &f64)| (a - b).abs() <= 1e-14 * b.abs();
+    let kept = found.len() == promised.len() && found.iter().zip(promised).all(close);
+    if kept { Ok(()) } else { Err(format!("input {input} has the gradient {found:?}, and {promised:?} was promised")) }
+}
+
+/// Where an input already has a gradient from elsewhere, the op's own is added to it.
+fn adds_to_what_is_there(s: &Subject) -> Result<(), String> {
+    let tape = Tape::new();
+    let vars = leaves(&tape, &s.inputs, &s.all);
+    let outputs = s.run(&vars);
+    let mut seeds: Vec<_> = outputs.iter().zip(cotangents(&outputs, SEED)).filter_map(|(y, c)| Some((y, c?))).collect();
+    let elsewhere = cotangents(&vars, SEED + 1);
+    seeds.extend(vars.iter().zip(&elsewhere).filter_map(|(x, c)| Some((x, c.clone()?))));
+    let mut together = tape.backward(&seeds);
+    for (i, (x, elsewhere)) in vars.iter().zip(&elsewhere).enumerate() {
+        let (Some(sum), Some(elsewhere)) = (together.take(x), elsewhere) else { continue };
+        for (k, (&sum, &other)) in sum.data().iter().zip(elsewhere.data()).enumerate() {
+            let expected = s.first().1[i].as_ref().map_or(0.0, |g| g.data()[k]) + other;
+            if (sum - expected).abs() > 1e-12 * expected.abs().max(1.0) || sum.is_nan() != expected.is_nan() {
+                return Err(format!("input {i}, element {k}: {sum:e} where {expected:e} had to be the sum"));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Two inputs of one shape that are one value: its gradient is the sum of what separate ones with its numbers get.
+fn adds_up_over_several_places(s: &Subject) -> Result<(), String> {
+    for j in 1..s.inputs.len() {
+        for i in 0..j {
+            if !(s.all[i] && s.all[j]) || s.inputs[i].shape() != s.inputs[j].shape() {
+                continue;
+            }
+            let mut numbers = s.inputs.clone();
+            numbers[i] = numbers[j].clone();
+            let apart = outcome(s.case, &numbers, &s.all).1;
+            let tape = Tape::new();
+            let mut vars = leaves(&tape, &numbers, &s.all);
+            vars[i] = vars[j].clone();
+            let outputs = s.run(&vars);
+            let seeds: Vec<_> =
+                outputs.iter().zip(cotangents(&outputs, SEED)).filter_map(|(y, c)| Some((y, c?))).collect();
+            let Some(together) = tape.backward(&seeds).take(&vars[j]) else { continue };
+            for (k, &g) in together.data().iter().enumerate() {
+                let sum: f64 = [i, j].iter().filter_map(|&i| apart[i].as_ref()).map(|g| g.data()[k]).sum();
+                if (g - sum).abs() > 1e-12 * sum.abs().max(1.0) || g.is_nan() != sum.is_nan() {
+                    return Err(format!("one value as inputs {i} and {j}, element {k}: {g:e} for {sum:e}"));
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The gradient of an input does not depend on whose else is wanted.
+fn is_the_same_for_every_subset_of_tracked_inputs(s: &Subject) -> Result<(), String> {
+    for subset in 1..1usize << s.inputs.len().min(4) {
+        let tracked: Vec<bool> =
+            s.all.iter().enumerate().map(|(i, &d)| d && (i >= 4 || subset >> i & 1 == 1)).collect();
+        if !tracked.contains(&true) {
+            continue;
+        }
+        let part = outcome(s.case, &s.inputs, &tracked);
+        same(s.first(), &part).map_err(|why| format!("{why} where {tracked:?} are tracked"))?;
+        for (i, (gradient, &on)) in part.1.iter().zip(&tracked).enumerate() {
+            if gradient.is_some() != (on && s.first().1[i].is_some()) {
+                return Err(format!("input {i}: a gradient missing, or one too many, where {tracked:?} are tracked"));
+            }
+        }
+    }
+    Ok(())
+}
+
+fn is_the_same_again(s: &Subject) -> Result<(), String> {
+    same(s.first(), &outcome(s.case, &s.inputs, &s.all))
+}
+
+fn is_the_same_on_one_and_two_threads(s: &Subject) -> Result<(), String> {
+    for threads in [1, 2] {
+        let again = parallel::with_threads(threads, || outcome(s.case, &s.inputs, &s.all));
+        same(s.first(), &again).map_err(|why| format!("{why} on {threads} threads"))?;
+    }
+    Ok(())
+}
+
+/// Buffers full of NaN instead of what was left in them: whoever reads before writing is found. The switch is one for
+/// the whole process; those who come here take turns.
+fn is_the_same_over_poisoned_memory(s: &Subject) -> Result<(), String> {
+    same(s.first(), &poisoned(s, &s.inputs))
+}
+
+/// The outcome over buffers full of NaN.
+fn poisoned(s: &Subject, inputs: &[Tensor<f64>]) -> Outcome {
+    static TURN: Mutex<()> = Mutex::new(());
+    /// Turns the poison off, also where the op panics.
+    struct Clean;
+    impl Drop for Clean {
+        fn drop(&mut self) {
+            pool::set_poison(false);
+        }
+    }
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let _clean = Clean;
+    pool::set_poison(true);
+    outcome(s.case, inputs, &s.all)
+}
+
+/// The same where numbers are exactly zero: loops that skip zeros leave what they should have written.
+fn is_the_same_over_poisoned_memory_at_zeros(s: &Subject) -> Result<(), String> {
+    let mut inputs = s.inputs.clone();
+    for (x, input) in inputs.iter_mut().zip(s.case.inputs()) {
+        if input.constant.is_none() && !matches!(input.fill, Fill::Values(_)) {
+            x.data_mut().iter_mut().step_by(2).for_each(|x| *x = 0.0);
+        }
+    }
+    let clean = || outcome(s.case, &inputs, &s.all);
+    let (once, again, over_nan) = (clean(), clean(), poisoned(s, &inputs));
+    same(&once, &again).and_then(|()| same(&once, &over_nan)).map_err(|why| format!("{why} where inputs are zero"))
+}
+
+/// The kernels in f32 against those in f64, forward and backward, on the same (rounded) numbers.
+fn is_nearly_the_same_in_single_precision(s: &Subject) -> Result<(), String> {
+    let single: Vec<Tensor<f32>> = s.inputs.iter().map(Tensor::cast).collect();
+    let rounded: Vec<Tensor<f64>> = single.iter().map(Tensor::cast).collect();
+    let double = outcome(s.case, &rounded, &s.all);
+    let tape = Tape::new();
+    let leaf = |(x, &on): (&Tensor<f32>, &bool)| if on { tape.leaf(x.clone()) } else { Var::constant(x.clone()) };
+    let vars: Vec<Var<f32>> = single.iter().zip(&s.all).map(leaf).collect();
+    let outputs = s.case.run_f32(&vars.iter().collect::<Vec<_>>());
+    for (i, (y, exact)) in outputs.iter().zip(&double.0).enumerate() {
+        close(y.value(), exact).map_err(|why| format!("output {i}, {why}"))?;
+    }
+    let seeds64 = cotangents(&s.run(&leaves(&Tape::new(), &rounded, &s.all)), SEED);
+    let seeds: Vec<_> = outputs.iter().zip(&seeds64).filter_map(|(y, c)| Some((y, c.as_ref()?.cast()))).collect();
+    let gradients = tape.backward(&seeds);
+    for (i, (v, exact)) in vars.iter().zip(&double.1).enumerate() {
+        if let (Some(g), Some(exact)) = (gradients.get(v), exact) {
+            close(g, exact).map_err(|why| format!("the gradient of input {i}, {why}"))?;
+        }
+    }
+    Ok(())
+}
+
+fn close(single: &Tensor<f32>, double: &Tensor<f64>) -> Result<(), String> {
+    let finite = |x: f64| if x.is_finite() { x.abs() } else { 0.0 };
+    let scale = double.data().iter().fold(1e-3, |m: f64, &x| m.max(finite(x)));
+    for (k, (&x, &y)) in single.data().iter().zip(double.data()).enumerate() {
+        let close = (x as f64 - y).abs() <= 1e-4 * scale || (x as f64 == y) || (x.is_nan() && y.is_nan());
+        if !close {
+            return Err(format!("element {k}: {x} in f32, {y} in f64 (scale {scale:e})"));
+        }
+    }
+    Ok(())
+}
+
+/// What an op did wrong, in one check of one case.
+#[derive(Clone, Debug, Serialize)]
+pub struct Complaint {
+    /// The case.
+    pub case: &'static str,
+    /// The kernel path.
+    pub algo: &'static str,
+    /// The check, by its name in [`CHECKS`] (or `zeros`).
+    pub check: &'static str,
+    /// What is wrong.
+    pub why: String,
+}
+
+/// What [`check_op`] found.
+#[derive(Clone, Debug, Serialize)]
+pub struct OpReport {
+    /// The op.
+    pub op: &'static str,
+    /// Its cases.
+    pub cases: usize,
+    /// What is wrong.
+    pub complaints: Vec<Complaint>,
+}
+
+impl OpReport {
+    /// Whether the op passes every check on every case, of which there must be one.
+    pub fn is_right(&self) -> bool {
+        self.cases > 0 && self.complaints.is_empty()
+    }
+}
+
+impl fmt::Display for OpReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for Complaint { case, algo, check, why } in &self.complaints {
+            writeln!(f, "{} [{algo}] \"{case}\", {check}: {why}", self.op)?;
+        }
+        let verdict = if self.is_right() { "right" } else { "WRONG" };
+        write!(f, "{} in {} cases: {verdict}", self.op, self.cases)
+    }
+}
+
+/// Holds an op to everything that the ops of this crate are held to, on its own cases: finite differences, what it adds
+/// to gradients that are there already, one value as several inputs, subsets of tracked inputs, repetition, threads,
+/// memory full of NaN (also where inputs are zero), f32 against f64.
+///
+/// The poison of memory is a switch of the whole process: an op that runs on another thread meanwhile and reads what it
+/// did not write sees NaN, too.
+pub fn check_op<O: Op<f64> + Op<f32>>() -> OpReport {
+    let entry = Entry::of::<O>();
+    let cases = entry.cases();
+    let mut complaints = Vec::new();
+    for case in &cases {
+        let subject = Subject::new(case.as_ref());
+        let zeros: (&str, Check) = ("zeros", is_the_same_over_poisoned_memory_at_zeros);
+        for (check, run) in CHECKS.into_iter().chain([zeros]) {
+            let why = run(&subject).err();
+            complaints.extend(why.map(|why| Complaint { case: case.name(), algo: case.algo(), check, why }));
+        }
+    }
+    OpReport { op: entry.name, cases: cases.len(), complaints }
+}
