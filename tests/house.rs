@@ -124,7 +124,7 @@ fn kernels_ask_for_the_sizes_at_which_they_cut() {
                 for arguments in line.split(cut).skip(1) {
                     seen += 1;
                     let until = arguments.split(')').next().unwrap_or_default();
-                    let mut words = until.split(|c: char| !c.is_alphanumeric() && c != '_');
+                    let words = until.split(|c: char| !c.is_alphanumeric() && c != '_');
                     let constant = words
                         .into_iter()
                         .find(|word| word.len() > 2 && word.chars().all(|c| c.is_ascii_uppercase() || c == '_'));

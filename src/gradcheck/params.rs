@@ -70,10 +70,12 @@ impl<F: Fn(&Context<f64>) -> Var<f64>> Function for Model<'_, F> {
         self.run(values, |tape, context, loss| {
             let seeds: Vec<_> = cotangents.iter().flatten().map(|c| (&loss, c.clone())).collect();
             let mut all = context.gradients(&mut tape.backward(&seeds));
+            context.into_moved();
             let tracked = self.options.tracked(values.len());
             let zeros = |i: usize| Tensor::zeros(*values[i].shape());
-            let take =
-                |(i, id): (usize, &ParamId)| tracked.contains(&i).then(|| all[id.0].take().unwrap_or_else(|| zeros(i)));
+            let take = |(i, id): (usize, &ParamId)| {
+                tracked.contains(&i).then(|| all[id.index()].take().unwrap_or_else(|| zeros(i)))
+            };
             self.learnt.iter().enumerate().map(take).collect()
         })
     }
