@@ -164,7 +164,7 @@ impl Float for f32 {
         f32::mul_add(self, a, b)
     }
 
-    /// e^x = 2^n (1 + q), see [`reduced`]. 2^n is applied in two halves, which lets the result fall into the subnormals
+    /// e^x = 2^n (1 + q), see `reduced`. 2^n is applied in two halves, which lets the result fall into the subnormals
     /// and to 0 by itself.
     #[inline(always)]
     fn exp(self) -> f32 {
