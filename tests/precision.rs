@@ -57,7 +57,7 @@ fn functions() -> Vec<Function> {
             1.0,
             9e-8,
         ),
-        f("gelu", |x| x.gelu(), |x| times(x, phi(x)), |x| phi(x) + times(x, density(x)), 5.0, 5.0, 9e-8),
+        f("gelu", |x| x.gelu(), |x| times(x, phi(x)), |x| phi(x) + times(x, density(x)), 5.0, 5.0, 2e-7),
         f(
             "hardswish",
             |x| x.hardswish(),
@@ -76,7 +76,7 @@ fn functions() -> Vec<Function> {
             2e-7,
         ),
         f("sigmoid", |x| x.sigmoid(), sigmoid, |x| sigmoid(x) * sigmoid(-x), 2.5, 2.5, 9e-8),
-        f("tanh", |x| x.tanh(), f64::tanh, |x| 1.0 / x.cosh().powi(2), 2.0, 2.0, 1.2e-7),
+        f("tanh", |x| x.tanh(), f64::tanh, |x| 1.0 / x.cosh().powi(2), 2.0, 2.0, 2e-7),
         f("exp", |x| x.exp(), f64::exp, f64::exp, 1.0, 1.0, 0.0),
         f("log", |x| x.log(), f64::ln, |x| 1.0 / x, 1.0, 1.0, 0.0),
         f("sqrt", |x| x.sqrt(), f64::sqrt, |x| 0.5 / x.sqrt(), 0.5, 1.5, 0.0),
@@ -99,7 +99,7 @@ fn functions() -> Vec<Function> {
             |x| times(x, sigmoid(x)),
             |x| sigmoid(x) + times(times(x, sigmoid(x)), sigmoid(-x)),
             3.0,
-            2.0,
+            3.0,
             4e-8,
         ),
         f(
@@ -240,8 +240,8 @@ fn reductions_keep_their_digits() {
     for (name, x) in [("many", &many), ("far from 0", &far)] {
         let numbers = wide(x);
         let (sum, count) = (numbers.iter().sum::<f64>(), numbers.len() as f64);
-        close(&format!("sum of {name}"), constant(x).sum_all().value().item(), sum, 4.0);
-        close(&format!("mean of {name}"), constant(x).mean_all().value().item(), sum / count, 5.0);
+        close(&format!("sum of {name}"), constant(x).sum_all().value().item(), sum, 8.0);
+        close(&format!("mean of {name}"), constant(x).mean_all().value().item(), sum / count, 8.0);
         let var = numbers.iter().map(|v| (v - sum / count).powi(2)).sum::<f64>() / count;
         let found = constant(x).variance(0, 1, 0).value().item();
         assert!((f64::from(found) / var - 1.0).abs() < 1e-4, "variance of {name}: {found} for {var}");

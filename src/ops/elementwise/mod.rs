@@ -26,12 +26,12 @@
 //! | `exp` | 1 | 1 | |
 //! | `elu` | 1.5 | 1 | 9e-8 |
 //! | `softplus`, `log_sigmoid` | 2 | 2.5 | |
-//! | `tanh` | 2 | 2 | 1.2e-7 |
+//! | `tanh` | 2 | 2 | 2e-7 |
 //! | `sigmoid` | 2.5 | 2.5 | 9e-8 |
 //! | `hardswish` | 2.5 | 1 | 2e-7 |
-//! | `silu` | 3 | 2 | 4e-8 |
+//! | `silu` | 3 | 3 | 4e-8 |
 //! | `hardsigmoid` | 3 | 0.5 | |
-//! | `gelu` | 5 | 5 | 9e-8 |
+//! | `gelu` | 5 | 5 | 2e-7 |
 //!
 //! Results below 1e-36 may lose some of the last places of the subnormals.
 
