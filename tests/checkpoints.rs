@@ -149,7 +149,7 @@ fn tensors() -> Vec<(String, Vec<usize>, Vec<f32>)> {
 fn write_pth(path: &Path, tensors: &[(String, Vec<usize>, Vec<f32>)]) {
     let entries: Vec<(String, Saved<'_>)> =
         tensors.iter().map(|(name, shape, data)| (name.clone(), Saved::F32 { shape, data })).collect();
-    std::fs::write(path, pth::to_bytes("x", &entries).expect("entries")).expect("written");
+    pth::write(std::fs::File::create(path).expect("writable"), "x", &entries).expect("written");
 }
 
 /// The message with which this is refused, within a second.
@@ -252,7 +252,7 @@ fn weights_that_do_not_fit_are_listed() {
     );
 
     let entries = [("height".to_owned(), Saved::Int(100)), ("stem.x".to_owned(), Saved::I64(1))];
-    std::fs::write(&file, pth::to_bytes("x", &entries).expect("entries")).expect("written");
+    pth::write(std::fs::File::create(&file).expect("writable"), "x", &entries).expect("written");
     let error = refusal(std::slice::from_ref(&file));
     assert!(error.contains("height: 100 is not a multiple of 32"), "{error}");
 }

@@ -1,6 +1,6 @@
 //! Depth as KITTI stores it: a 16-bit grey PNG of metres times 256, 0 where nothing is known.
 
-use std::io;
+use std::io::{self, Write};
 use std::path::Path;
 
 use image::codecs::png::PngEncoder;
@@ -30,7 +30,7 @@ pub fn write_depth_png(path: impl AsRef<Path>, depth: &DepthMap) -> Result<()> {
     }
     let bytes: Vec<u8> = depth.metres.iter().flat_map(|&m| encode_depth(m).to_ne_bytes()).collect();
     write_atomically(path, |writer| {
-        PngEncoder::new(writer)
+        PngEncoder::new(writer as &mut dyn Write)
             .write_image(&bytes, width as u32, height as u32, ExtendedColorType::L16)
             .map_err(io::Error::other)
     })

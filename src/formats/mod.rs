@@ -26,6 +26,7 @@ pub mod ply;
 pub mod png;
 pub mod pth;
 pub mod safetensors;
+mod source;
 mod stored;
 mod tensor_file;
 

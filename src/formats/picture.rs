@@ -3,7 +3,7 @@
 
 use std::cell::Cell;
 use std::fs::File;
-use std::io::{BufRead, BufReader, Cursor, Read, Seek};
+use std::io::{BufReader, Cursor, Read, Seek};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::sync::Once;
@@ -13,6 +13,7 @@ use image::{DynamicImage, ImageDecoder, ImageError, ImageReader, Limits, RgbImag
 
 pub use super::bounded::MAX_PIXELS;
 use super::picture_structure as structure;
+use super::source::Source;
 use crate::{Error, Result};
 
 /// Files with more bytes are not read: no picture of [`MAX_PIXELS`] needs so many.
@@ -38,7 +39,7 @@ pub fn check_picture(path: &Path) -> Result<(u32, u32)> {
     let file = open(path)?;
     let mut head = Vec::new();
     (&file).take(HEAD).read_to_end(&mut head).map_err(|e| Error::io(path, e))?;
-    let dimensions = match dimensions(Cursor::new(&head)) {
+    let dimensions = match dimensions(&mut Cursor::new(&head)) {
         Err(_) if head.len() as u64 == HEAD => {
             let mut reader = BufReader::new(&file);
             reader.rewind().map_err(|e| Error::io(path, e))?;
@@ -47,10 +48,10 @@ pub fn check_picture(path: &Path) -> Result<(u32, u32)> {
                 true => {
                     head.clear();
                     reader.take(MAX_PREFACE).read_to_end(&mut head).map_err(|e| Error::io(path, e))?;
-                    dimensions(Cursor::new(&head))
+                    dimensions(&mut Cursor::new(&head))
                 }
                 // A WebP's blocks are passed over, not read.
-                false => dimensions(reader),
+                false => dimensions(&mut reader),
             }
         }
         result => result,
@@ -70,7 +71,7 @@ fn open(path: &Path) -> Result<File> {
 
 /// Width and height by the header. Of a PNG nothing else is looked at: its decoder would unpack a colour profile first,
 /// whatever that comes to.
-fn dimensions(mut file: impl BufRead + Seek) -> Result<(u32, u32), Undecodable> {
+fn dimensions(mut file: &mut dyn Source) -> Result<(u32, u32), Undecodable> {
     fenced(|| {
         let mut start = Vec::new();
         (&mut file).take(structure::PNG_HEADER).read_to_end(&mut start)?;
@@ -144,11 +145,12 @@ fn undecodable(path: &Path, error: &Undecodable) -> Error {
 pub fn decode(path: &Path) -> Result<DynamicImage> {
     let mut bytes = Vec::new();
     open(path)?.take(MAX_BYTES).read_to_end(&mut bytes).map_err(|e| Error::io(path, e))?;
-    let size = dimensions(Cursor::new(&bytes)).map_err(|e| undecodable(path, &e))?;
+    let size = dimensions(&mut Cursor::new(&bytes)).map_err(|e| undecodable(path, &e))?;
     let (width, height) = check_size(path, size)?;
     structure::check(&bytes).map_err(|fault| Error::file(path, fault))?;
     fenced(|| {
-        let mut reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format()?;
+        let mut source = Cursor::new(&bytes);
+        let mut reader = ImageReader::new(&mut source as &mut dyn Source).with_guessed_format()?;
         // Pixels have at most eight bytes; what lies beside them (colour profiles, texts) gets no more than that again.
         let mut limits = Limits::default();
         limits.max_alloc = Some(16 * u64::from(width) * u64::from(height) + (32 << 20));

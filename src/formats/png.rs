@@ -1,9 +1,10 @@
 //! Colour pictures as PNG files.
 
-use std::io::{self, Cursor, Write};
+use std::io::{self, Write};
 use std::path::Path;
 
-use image::{ImageFormat, RgbImage};
+use image::codecs::png::PngEncoder;
+use image::{ExtendedColorType, ImageEncoder, RgbImage};
 
 use super::atomic::write_atomically;
 use crate::Result;
@@ -13,12 +14,11 @@ use crate::Result;
 /// # Errors
 /// If the picture is empty or the file cannot be written: the path and why.
 pub fn write_png(path: impl AsRef<Path>, picture: &RgbImage) -> Result<()> {
-    // Encoding seeks, which a file that is still being written need not.
-    let mut bytes = Cursor::new(Vec::new());
-    let encoded = picture.write_to(&mut bytes, ImageFormat::Png);
+    let (width, height) = picture.dimensions();
     write_atomically(path.as_ref(), |writer| {
-        encoded.map_err(io::Error::other)?;
-        writer.write_all(bytes.get_ref())
+        PngEncoder::new(writer as &mut dyn Write)
+            .write_image(picture.as_raw(), width, height, ExtendedColorType::Rgb8)
+            .map_err(io::Error::other)
     })
 }
 

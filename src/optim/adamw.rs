@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use crate::nn::{Identity, Params, same_model};
-use crate::tensor::{Float, Tensor, parallel, regime, simd};
+use crate::tensor::{Float, Tensor, parallel, regime};
 
 /// Settings of a parameter group.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -72,7 +72,7 @@ impl<T: Float> AdamW<T> {
             let pieces = weights.data_mut().chunks_mut(chunk).zip(g.data().chunks(chunk));
             let pieces = pieces.zip(m.data_mut().chunks_mut(chunk).zip(v.data_mut().chunks_mut(chunk)));
             parallel::for_each_piece(pieces, 8 * g.len(), |((w, g), (m, v))| {
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         for ((w, &g), (m, v)) in w.iter_mut().zip(g).zip(m.iter_mut().zip(v)) {

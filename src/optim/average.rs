@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use crate::nn::{Identity, Params, same_model};
-use crate::tensor::{Float, Tensor, parallel, regime, simd};
+use crate::tensor::{Float, Tensor, parallel, regime};
 
 /// Elements handed to a thread at a time.
 const CHUNK: usize = 1 << 14;
@@ -40,7 +40,7 @@ impl<T: Float> Average<T> {
             let chunk = regime::size(CHUNK);
             parallel::for_each_chunk(average.data_mut(), chunk, 2 * weights.len(), |i, average| {
                 let weights = &weights[i * chunk..][..average.len()];
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || average.iter_mut().zip(weights).for_each(|(a, &w)| *a += take * (w - *a)),
                 );

@@ -1,6 +1,6 @@
 //! The norm of all gradients together, and a bound on it.
 
-use crate::tensor::{Float, Tensor, parallel, regime, simd};
+use crate::tensor::{Float, Tensor, parallel, regime};
 
 /// Elements handed to a thread at a time.
 const CHUNK: usize = 1 << 14;
@@ -9,7 +9,7 @@ const CHUNK: usize = 1 << 14;
 fn sum_of_squares<T: Float>(x: &[T]) -> f64 {
     let (blocks, rest) = x.as_chunks::<16>();
     let mut result = [0.0; 16];
-    simd::dispatch(
+    T::dispatch(
         #[inline(always)]
         || {
             let mut sums = result;

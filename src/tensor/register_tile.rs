@@ -11,7 +11,7 @@ use pulp::{Simd, WithSimd};
 
 use super::gemm::Accum;
 use super::pool::Buffer;
-use super::simd::{copy_run, dispatch_vector};
+use super::simd::copy_run;
 use super::{Float, parallel, simd};
 
 /// Vectors side by side in a tile of the result.
@@ -78,7 +78,7 @@ impl<'a, T: Float> Panels<'a, T> {
             parallel::for_each_chunk(&mut data, wide * rows, work, |k, panel| {
                 let (first, step) = (k * wide, panel.len() / rows);
                 let width = step.min(cols - first);
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         if width < step {
@@ -130,7 +130,7 @@ impl<T: Float> Product<'_, T> {
             }
             return;
         }
-        dispatch_vector(self);
+        T::dispatch(self);
     }
 
     #[inline(always)]
@@ -321,7 +321,7 @@ impl<T: Float> Gram<'_, T> {
     /// If a slice is too short.
     pub(crate) fn run(self) {
         if self.rows * self.cols * self.count > 0 {
-            dispatch_vector(self);
+            T::dispatch(self);
         }
     }
 

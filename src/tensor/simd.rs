@@ -68,17 +68,33 @@ pub fn level() -> Result<&'static str> {
     Ok(label(*ARCH))
 }
 
-/// Runs `kernel` compiled for the best instruction set of this machine.
-///
-/// Write the closure as `#[inline(always)] || ...`, and mark the functions it calls the same way: what is not inlined
-/// is compiled for the baseline.
 #[inline(always)]
-pub fn dispatch<R>(kernel: impl FnOnce() -> R) -> R {
+fn up_to_avx512<K: WithSimd>(kernel: K) -> K::Output {
+    ARCH.dispatch(kernel)
+}
+
+#[inline(always)]
+#[cfg(target_arch = "x86_64")]
+fn up_to_avx2<K: WithSimd>(kernel: K) -> K::Output {
+    let avx2 = match *ARCH {
+        Arch::V4(simd) => Some(*simd),
+        Arch::V3(simd) => Some(simd),
+        _ => None,
+    };
+    match avx2 {
+        Some(simd) => Simd::vectorize(simd, kernel),
+        None => Simd::vectorize(pulp::Scalar::new(), kernel),
+    }
+}
+
+#[inline(always)]
+#[cfg(not(target_arch = "x86_64"))]
+fn up_to_avx2<K: WithSimd>(kernel: K) -> K::Output {
     ARCH.dispatch(kernel)
 }
 
 /// Copies a run, in whole vectors as far as they go: some runs are too short for a call to `memcpy`. To be called inside
-/// [`dispatch`].
+/// [`Vector::dispatch`].
 #[inline(always)]
 pub(crate) fn copy_run<T: Copy>(to: &mut [T], from: &[T]) {
     let ((to, to_rest), (from, from_rest)) = (to.as_chunks_mut::<8>(), from.as_chunks::<8>());
@@ -87,10 +103,18 @@ pub(crate) fn copy_run<T: Copy>(to: &mut [T], from: &[T]) {
 }
 
 /// Element types of which there are vectors, for the few kernels that keep vectors in registers across loops of their
-/// own, which the compiler does not find by itself. Run one with [`dispatch_vector`].
+/// own, which the compiler does not find by itself. Run one with [`Vector::dispatch`].
 pub trait Vector: Copy + 'static {
     /// A vector of the instruction set `S`.
     type V<S: Simd>: Copy;
+
+    /// Runs a kernel of this element type compiled for the best instruction set that it is compiled for: in f32 the
+    /// machine's, in f64 AVX2 at most. f64 is what gradients are checked in, and a third instance of each of its loops
+    /// would take a tenth of the time that the crate takes to compile.
+    ///
+    /// Write a closure as `#[inline(always)] || ...`, and mark the functions it calls the same way: what is not inlined
+    /// is compiled for the baseline.
+    fn dispatch<K: WithSimd>(kernel: K) -> K::Output;
 
     /// Elements in a vector.
     fn lanes<S: Simd>() -> usize;
@@ -113,10 +137,14 @@ pub trait Vector: Copy + 'static {
 }
 
 macro_rules! vector {
-    ($t:ty, $v:ident, $lanes:ident, $splat:ident, $load:ident, $store:ident, $add:ident, $fma:ident, $total:ident, $of:ident, $of_mut:ident) => {
+    ($t:ty, $dispatch:ident, $v:ident, $lanes:ident, $splat:ident, $load:ident, $store:ident, $add:ident, $fma:ident, $total:ident, $of:ident, $of_mut:ident) => {
         impl Vector for $t {
             type V<S: Simd> = S::$v;
 
+            #[inline(always)]
+            fn dispatch<K: WithSimd>(kernel: K) -> K::Output {
+                $dispatch(kernel)
+            }
             #[inline(always)]
             fn lanes<S: Simd>() -> usize {
                 S::$lanes
@@ -159,6 +187,7 @@ macro_rules! vector {
 
 vector!(
     f32,
+    up_to_avx512,
     f32s,
     F32_LANES,
     splat_f32s,
@@ -172,6 +201,7 @@ vector!(
 );
 vector!(
     f64,
+    up_to_avx2,
     f64s,
     F64_LANES,
     splat_f64s,
@@ -194,13 +224,7 @@ pub(crate) fn lanes<T: Vector>() -> usize {
             T::lanes::<S>()
         }
     }
-    dispatch_vector(Lanes::<T>(std::marker::PhantomData))
-}
-
-/// Runs a kernel that is written in [`Vector`]s with those of the best instruction set of this machine.
-#[inline(always)]
-pub fn dispatch_vector<K: WithSimd>(kernel: K) -> K::Output {
-    ARCH.dispatch(kernel)
+    T::dispatch(Lanes::<T>(std::marker::PhantomData))
 }
 
 #[cfg(test)]

@@ -9,6 +9,7 @@ use std::time::Instant;
 use parallax::Result;
 use parallax::random::Random;
 use parallax::tensor::gemm::{Rows, RowsMut, gemm};
+use parallax::tensor::simd::Vector;
 use parallax::tensor::{Accum, parallel, simd};
 use serde::Serialize;
 
@@ -187,7 +188,7 @@ fn memory_ceiling() -> f64 {
     let seconds = best(6, || {
         parallel::for_each_chunk(&mut a, CHUNK, usize::MAX, |i, a| {
             let (b, c) = (&b[i * CHUNK..][..a.len()], &c[i * CHUNK..][..a.len()]);
-            simd::dispatch(
+            f32::dispatch(
                 #[inline(always)]
                 || a.iter_mut().zip(b.iter().zip(c)).for_each(|(a, (&b, &c))| *a = c.mul_add(0.5, b)),
             );

@@ -19,18 +19,19 @@ use zip::result::ZipError;
 
 use super::state::{Format, State};
 use super::{MAX_DIRECTORY, MAX_INFLATION, MAX_PICKLE, PthError, SMALL, pickle, shown};
+use crate::formats::source::Source;
 use crate::formats::stored::Storage;
 
 /// PyTorch itself refuses what is newer.
 const NEWEST_VERSION: u32 = 10;
 
 /// An error unless the archive has a table of contents, of which no more than that is read.
-pub(in crate::formats) fn check(file: impl Read + Seek) -> Result<(), PthError> {
-    open(file).map(|_| ())
+pub(in crate::formats) fn check(mut file: impl Source) -> Result<(), PthError> {
+    open(Box::new(&mut file)).map(|_| ())
 }
 
 /// Reads the table of contents, and not more than `MAX_DIRECTORY` bytes while looking for it.
-fn open<R: Read + Seek>(mut file: R) -> Result<ZipArchive<Limited<R>>, PthError> {
+fn open<'b>(mut file: Box<dyn Source + 'b>) -> Result<ZipArchive<Limited<'b>>, PthError> {
     // The table ends with this record of 22 bytes, behind which there can be a comment of up to 65535.
     let size = file.seek(SeekFrom::End(0))?;
     file.seek(SeekFrom::Start(size.saturating_sub(22 + 65_535)))?;
@@ -59,12 +60,12 @@ fn open<R: Read + Seek>(mut file: R) -> Result<ZipArchive<Limited<R>>, PthError>
 }
 
 /// Reads only so many bytes: an archive can name many places at which its table of contents might begin.
-struct Limited<R> {
-    inner: R,
+struct Limited<'b> {
+    inner: Box<dyn Source + 'b>,
     left: Rc<Cell<u64>>,
 }
 
-impl<R: Read> Read for Limited<R> {
+impl Read for Limited<'_> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let left = self.left.get();
         if left == 0 {
@@ -77,7 +78,7 @@ impl<R: Read> Read for Limited<R> {
     }
 }
 
-impl<R: Seek> Seek for Limited<R> {
+impl Seek for Limited<'_> {
     fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
         self.inner.seek(to)
     }
@@ -116,7 +117,7 @@ pub(in crate::formats) enum Expected {
 }
 
 pub(in crate::formats) struct Archive<'b> {
-    zip: ZipArchive<Limited<Cursor<&'b [u8]>>>,
+    zip: ZipArchive<Limited<'b>>,
     bytes: &'b Arc<Vec<u8>>,
     /// The bytes of entries that may still be read. Entries could overlap, and so be more than the file.
     stored_left: u64,
@@ -126,7 +127,7 @@ pub(in crate::formats) struct Archive<'b> {
 
 impl<'b> Archive<'b> {
     pub(in crate::formats) fn open(bytes: &'b Arc<Vec<u8>>) -> Result<Self, PthError> {
-        let zip = open(Cursor::new(bytes.as_slice()))?;
+        let zip = open(Box::new(Cursor::new(bytes.as_slice())))?;
         let size = bytes.len() as u64;
         Ok(Archive { zip, bytes, stored_left: size, inflated_left: size.saturating_mul(MAX_INFLATION) + SMALL })
     }

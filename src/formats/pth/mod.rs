@@ -24,7 +24,7 @@ mod write;
 mod tests;
 
 pub use state::{Format, Item, Plain, State};
-pub use write::{Saved, to_bytes, write};
+pub use write::{Saved, write};
 
 use std::fs::File;
 use std::io::{self, BufReader, Read, Seek, SeekFrom};

@@ -10,6 +10,13 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 use super::*;
 use crate::formats::stored::{Dtype, StoredTensor};
 
+/// What is written, in memory.
+fn to_bytes(name: &str, entries: &[(String, Saved<'_>)]) -> Result<Vec<u8>, PthError> {
+    let mut out = Cursor::new(Vec::new());
+    write(&mut out, name, entries)?;
+    Ok(out.into_inner())
+}
+
 /// The checkpoints that `gen_pth.py` made, and what torch says is in them.
 fn made(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/pth").join(name)

@@ -1,7 +1,7 @@
 //! Writes the zip format, for `torch.load(weights_only=True)`.
 
 use std::collections::{HashMap, HashSet};
-use std::io::{Cursor, Seek, Write};
+use std::io::{Seek, Write};
 
 use zip::write::{SimpleFileOptions, ZipWriter};
 use zip::{CompressionMethod, DateTime};
@@ -67,13 +67,6 @@ pub fn write<W: Write + Seek>(out: W, name: &str, entries: &[(String, Saved<'_>)
     add("version", &|zip| zip.write_all(b"3\n"), 2)?;
     zip.finish().map_err(zip_error)?.flush()?;
     Ok(())
-}
-
-/// [`write()`] into memory.
-pub fn to_bytes(name: &str, entries: &[(String, Saved<'_>)]) -> Result<Vec<u8>, PthError> {
-    let mut out = Cursor::new(Vec::new());
-    write(&mut out, name, entries)?;
-    Ok(out.into_inner())
 }
 
 fn zip_error(e: zip::result::ZipError) -> PthError {

@@ -6,7 +6,7 @@ use crate::ops::support::put::put_run;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::gemm::Rows;
 use crate::tensor::pool::Buffer;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
 /// Factorised attention: `out = c^(-1/2) q (softmax(k)^T v)` for each head of c channels, the softmax over the tokens
 /// (Xu et al. 2021, 2104.06399, equation 6).
@@ -164,7 +164,7 @@ impl<T: Float> Op<T> for FactorisedAttention {
                 let (max, share) =
                     (&softmax.max[b * channels..][..channels], &softmax.share[b * channels..][..channels]);
                 let (mut p, mut product) = (Buffer::stale(rows * channels), Buffer::stale(rows * channels));
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         for (p, k) in p.chunks_exact_mut(channels).zip(qkv.chunks_exact(stride)) {
@@ -178,7 +178,7 @@ impl<T: Float> Op<T> for FactorisedAttention {
                 heads.product(&mut product, g, mt);
                 put(out, stride, 0, accum, &product, channels);
                 heads.product(&mut product, Rows::columns(qkv, rows, stride, 2 * channels, channels), dmt);
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         for (d, p) in product.chunks_exact_mut(channels).zip(p.chunks_exact(channels)) {
@@ -216,7 +216,7 @@ fn contexts<T: Float>(e: &Extents, qkv: &[T]) -> (Statistics<T>, Buffer<T>) {
         let (max, rest) = part.split_at_mut(channels);
         let (sum, product) = rest.split_at_mut(channels);
         let mut powers = Buffer::stale(k.rows * channels);
-        simd::dispatch(
+        T::dispatch(
             #[inline(always)]
             || {
                 max.fill(-T::INFINITY);
@@ -239,7 +239,7 @@ fn contexts<T: Float>(e: &Extents, qkv: &[T]) -> (Statistics<T>, Buffer<T>) {
     let mut share = Buffer::filled(e.batch * channels, T::ZERO);
     let mut context = Buffer::filled(e.batch * size, T::ZERO);
     // Compiled for the machine's vectors: without, every `mul_add` is a call into the C library.
-    simd::dispatch(
+    T::dispatch(
         #[inline(always)]
         || {
             for b in 0..e.batch {

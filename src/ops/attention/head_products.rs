@@ -7,7 +7,7 @@
 
 use crate::tensor::gemm::{Rows, RowsMut, gemm};
 use crate::tensor::pool::Buffer;
-use crate::tensor::{Accum, Float, simd};
+use crate::tensor::{Accum, Float};
 
 /// The channels of a window.
 pub(in crate::ops) const LANES: usize = 16;
@@ -58,7 +58,7 @@ impl Heads {
             return;
         }
         let (matrices, _) = matrices.as_chunks::<LANES>();
-        simd::dispatch(
+        T::dispatch(
             #[inline(always)]
             || {
                 let mut at = 0;
@@ -121,7 +121,7 @@ fn group<T: Float, const G: usize>(
     c: usize,
 ) -> usize {
     let mut result = [[T::ZERO; LANES]; G];
-    simd::dispatch(
+    T::dispatch(
         #[inline(always)]
         || {
             // Sums that live outside the closure would be stored to memory at every step.

@@ -151,7 +151,7 @@ impl Plan {
                 return out.fill(T::ZERO);
             }
             let token = (b * self.height + y - pad) * self.width;
-            simd::dispatch(
+            T::dispatch(
                 #[inline(always)]
                 || {
                     for (k, out) in out.chunks_exact_mut(across).enumerate() {
@@ -259,7 +259,7 @@ impl Plan {
     ) -> usize {
         let ring = self.pad - s.block.window / 2;
         let mut result = [[T::ZERO; LANES]; G];
-        simd::dispatch(
+        T::dispatch(
             #[inline(always)]
             || {
                 // Sums that live outside the closure would be stored to memory at every step.
@@ -349,7 +349,7 @@ impl<T: Float> Op<T> for ConvRelativePosition {
             let rows = out.chunks_mut(line.max(1)).enumerate().map(|(i, out)| (i, out, kept.next()));
             parallel::for_each_piece(rows, work, |(i, out, mut kept)| {
                 let q = &qkv.data()[i * plan.width * stride..];
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         plan.row(
@@ -400,7 +400,7 @@ impl<T: Float> Op<T> for ConvRelativePosition {
                     put(accum, terms.map(|(o, (&g, &c))| (o, g * c)));
                     begin_sum(&mut out[channels..2 * channels], accum);
                 }
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         plan.row(

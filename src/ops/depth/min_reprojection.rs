@@ -4,7 +4,7 @@ use crate::ops::Tile;
 use crate::ops::support::put::put;
 use crate::ops::support::sums::pairwise_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply};
-use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
 /// Minimum reprojection: the mean over pixels of the minimum over `candidates`, one or more tensors of one shape; and
 /// (auxiliary) the index of the winner of each pixel, in that shape.
@@ -53,7 +53,7 @@ impl<T: Float> Op<T> for MinReprojection {
                 winner.fill(T::ZERO);
                 for (k, candidate) in inputs.iter().enumerate().skip(1) {
                     let (candidate, index) = (&candidate.data()[i * tile..][..winner.len()], T::of(k as f64));
-                    simd::dispatch(
+                    T::dispatch(
                         #[inline(always)]
                         || {
                             for ((best, winner), &x) in best.iter_mut().zip(winner.iter_mut()).zip(candidate) {
@@ -78,7 +78,7 @@ impl<T: Float> Op<T> for MinReprojection {
             let index = T::of(k as f64);
             sink.accumulate(k, |out, accum| {
                 let terms = out.iter_mut().zip(winner.data());
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || put(accum, terms.map(|(d, &w)| (d, if w == index { share } else { T::ZERO }))),
                 );

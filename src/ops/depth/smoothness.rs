@@ -4,7 +4,7 @@
 use crate::ops::support::put::{begin_sum, put};
 use crate::ops::support::sums::pairwise_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
-use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, pool::Buffer, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, pool::Buffer};
 
 /// Guards the division by the mean disparity, as published.
 const EPSILON: f64 = 1e-7;
@@ -88,7 +88,7 @@ impl<T: Float> Op<T> for Smoothness {
                 let next = &disparity.data()[at + step..][..direction.cols];
                 let mut terms = Buffer::stale(direction.cols);
                 let edges = &mut edges[..direction.cols];
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         channel_sums(near, far, channels, edges);

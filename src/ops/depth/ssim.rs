@@ -8,7 +8,7 @@
 use crate::ops::Tile;
 use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, pool::Buffer, simd};
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, pool::Buffer};
 
 const C1: f64 = 0.01 * 0.01;
 const C2: f64 = 0.03 * 0.03;
@@ -139,7 +139,7 @@ impl Kernel {
             for (k, out) in out.chunks_exact_mut(per_row).enumerate() {
                 let (sample, row) = ((i * self.tile + k) / height, (i * self.tile + k) % height);
                 let (x, y) = (Rows::of(x, sample), Rows::of(y, sample));
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         self.value_row(x, y, row, channels, &mut stats, &mut value);
@@ -201,7 +201,7 @@ impl Kernel {
             let mut scratch = Scratch::new(n, channels);
             let mut rows = out.chunks_exact_mut(n).zip(first..);
             for row in first.saturating_sub(1)..(end + 1).min(height) {
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         if self.ssim != 0.0 {

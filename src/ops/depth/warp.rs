@@ -7,7 +7,7 @@
 use crate::ops::Tile;
 use crate::ops::support::put::{begin_sum, put, put_rounded};
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, pool::Buffer, regime, simd};
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, pool::Buffer, regime};
 
 /// Guards the division by the projected depth, as published.
 const EPSILON: f64 = 1e-7;
@@ -290,7 +290,7 @@ fn gradient_row<T: Float>(
 /// Runs a kernel with the number of channels as a constant where there are three.
 macro_rules! with_channels {
     ($channels:expr, |$c:ident| $body:expr) => {
-        simd::dispatch(
+        T::dispatch(
             #[inline(always)]
             || match $channels {
                 3 => {

@@ -4,7 +4,7 @@
 use crate::ops::support::put::{begin_sum, put};
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply1};
 use crate::tensor::shape::MAX_RANK;
-use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime};
 
 /// A function of two numbers.
 pub trait Function: Copy + Send + Sync + Default + 'static {
@@ -191,7 +191,7 @@ where
                 let (chunk, work) = (regime::size(CHUNK), out.len());
                 parallel::for_each_chunk(out, chunk, work, |i, out| {
                     let (a, b) = (&a.data()[i * chunk..][..out.len()], &b.data()[i * chunk..][..out.len()]);
-                    simd::dispatch(
+                    T::dispatch(
                         #[inline(always)]
                         || out.iter_mut().zip(a.iter().zip(b)).for_each(|(y, (&a, &b))| *y = F::f(a, b)),
                     );
@@ -202,7 +202,7 @@ where
             let work = out.len();
             parallel::for_each_unit(out, slices.result, work, |i, out| {
                 let (a, b) = (&a.data()[i * slices.operands[0]..], &b.data()[i * slices.operands[1]..]);
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         for_each_run(&slices.shape, slices.strides[0], slices.strides[1], |io, ia, ib| {
@@ -243,7 +243,7 @@ where
                         let (a, b) =
                             operands.map_or((g, g), |(a, b)| (&a[first..first + g.len()], &b[first..first + g.len()]));
                         let terms = out.iter_mut().zip(g.iter().zip(a.iter().zip(b)));
-                        simd::dispatch(
+                        T::dispatch(
                             #[inline(always)]
                             || match side {
                                 0 => put(accum, terms.map(|(d, (&g, (&a, &b)))| (d, g * F::da(a, b)))),
@@ -264,7 +264,7 @@ where
                         let g = &g.data()[i * slices.result..][..slices.result];
                         let [first_a, first_b] = slices.operands.map(|own| i * own);
                         let operands = operands.map(|(a, b)| [&a[first_a..], &b[first_b..]]);
-                        simd::dispatch(
+                        T::dispatch(
                             #[inline(always)]
                             || match side {
                                 0 => slices.gradient(0, out, g, operands, F::da),

@@ -3,7 +3,7 @@
 use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::random::Random;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime, simd};
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime};
 
 /// `y = x mask / keep`: elements whose mask is 0 are dropped, the others scaled so that the mean stays.
 ///
@@ -30,7 +30,7 @@ fn masked<T: Float>(out: &mut [T], accum: Accum, x: &[T], mask: &[T], keep: f64)
     parallel::for_each_chunk(out, chunk, work, |i, out| {
         let (x, mask) = (&x[i * chunk..][..out.len()], &mask[i * chunk..][..out.len()]);
         let terms = out.iter_mut().zip(x.iter().zip(mask));
-        simd::dispatch(
+        T::dispatch(
             #[inline(always)]
             || put(accum, terms.map(|(y, (&x, &m))| (y, f(x, m)))),
         );

@@ -2,7 +2,7 @@
 
 use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
-use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime};
 
 /// `yes` where the condition is not 0 (NaN is not), else `no`; all three of one shape. The condition is not
 /// differentiated.
@@ -34,7 +34,7 @@ impl<T: Float> Op<T> for Select {
             parallel::for_each_chunk(out, chunk, work, |i, out| {
                 let part = |x: &'_ Tensor<T>| i * chunk..(i * chunk + chunk).min(x.len());
                 let (c, a, b) = (&condition.data()[part(condition)], &yes.data()[part(yes)], &no.data()[part(no)]);
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         let values = c.iter().zip(a.iter().zip(b));
@@ -59,7 +59,7 @@ impl<T: Float> Op<T> for Select {
                     let g = &g.data()[i * chunk..][..out.len()];
                     let terms = out.iter_mut().zip(c.iter().zip(g));
                     let share = |c: T, g: T| if (c != T::ZERO) == taken { g } else { T::ZERO };
-                    simd::dispatch(
+                    T::dispatch(
                         #[inline(always)]
                         || put(accum, terms.map(|(d, (&c, &g))| (d, share(c, g)))),
                     );

@@ -2,7 +2,7 @@
 
 use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply1};
-use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime};
 
 /// A function of one number.
 pub trait Function: Copy + Send + Sync + 'static {
@@ -44,7 +44,7 @@ where
             let (chunk, work) = (regime::size(CHUNK), 4 * out.len());
             parallel::for_each_chunk(out, chunk, work, |i, out| {
                 let x = &x.data()[i * chunk..][..out.len()];
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || out.iter_mut().zip(x).for_each(|(y, &x)| *y = f.f(x)),
                 );
@@ -62,7 +62,7 @@ where
             parallel::for_each_chunk(out, chunk, work, |i, out| {
                 let (g, s) = (&g.data()[i * chunk..][..out.len()], &s.data()[i * chunk..][..out.len()]);
                 let terms = out.iter_mut().zip(g.iter().zip(s));
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || put(accum, terms.map(|(d, (&g, &s))| (d, g * f.df(s)))),
                 );

@@ -2,7 +2,7 @@
 
 use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
-use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
 /// Max pooling: the largest element of each window of each channel of [batch, height, width, channels]. Padding never
 /// wins, a NaN does. Of several equal ones the first, row by row, gets the gradient.
@@ -90,7 +90,7 @@ impl<T: Float> Op<T> for MaxPool2d {
                         &mut scratch[..]
                     }
                 };
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         for (ox, (out, at)) in out.chunks_exact_mut(c).zip(at.chunks_exact_mut(c)).enumerate() {
@@ -127,7 +127,7 @@ impl<T: Float> Op<T> for MaxPool2d {
             let work = g.len() * kernel * kernel;
             parallel::for_each_unit(out, w * c, work, |i, out| {
                 let (image, y) = (i / h, i % h + padding);
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         begin_sum(out, accum);
@@ -199,7 +199,7 @@ impl<T: Float> Op<T> for AvgPool2d {
             let work = out.len() * kernel * kernel;
             parallel::for_each_unit(out, ow * c, work, |i, out| {
                 let (image, oy) = (i / oh, i % oh);
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         out.fill(T::ZERO);
@@ -228,7 +228,7 @@ impl<T: Float> Op<T> for AvgPool2d {
             let work = g.len() * kernel * kernel;
             parallel::for_each_unit(out, w * c, work, |i, out| {
                 let (image, y) = (i / h, i % h);
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         begin_sum(out, accum);

@@ -4,7 +4,7 @@ use crate::depth::half_pixel;
 use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::pool::Buffer;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime, simd};
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime};
 
 /// Bilinear resize of [batch, height, width, channels], each pixel interpolated between its four neighbours;
 /// no smoothing when it shrinks.
@@ -117,7 +117,7 @@ impl<T: Float> Op<T> for ResizeBilinear {
                     let at = i * tile + j;
                     let (image, tap) = (at / self.height * h, rows[at % self.height]);
                     let [low, high] = [tap.low, tap.high].map(|row| &x.data()[(image + row) * w * c..][..w * c]);
-                    simd::dispatch(
+                    T::dispatch(
                         #[inline(always)]
                         || {
                             for ((b, &l), &h) in blend.iter_mut().zip(low).zip(high) {
@@ -146,7 +146,7 @@ impl<T: Float> Op<T> for ResizeBilinear {
                 for (j, out) in out.chunks_exact_mut(w * c).enumerate() {
                     let at = i * tile + j;
                     let (image, row) = (at / h * self.height, at % h);
-                    simd::dispatch(
+                    T::dispatch(
                         #[inline(always)]
                         || {
                             blend.fill(T::ZERO);

@@ -3,7 +3,7 @@
 use crate::ops::support::squares::sum_squares;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::simd::copy_run;
-use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
 /// Nearest-neighbour upsampling: every pixel of [batch, height, width, channels] becomes a square of `scale` x `scale`
 /// pixels.
@@ -49,7 +49,7 @@ impl<T: Float> Op<T> for UpsampleNearest {
             parallel::for_each_unit(out, s * row, work, |i, out| {
                 let (first, copies) = out.split_at_mut(row);
                 let x = &x.data()[i * w * c..][..w * c];
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         for (square, x) in first.chunks_exact_mut(s * c).zip(x.chunks_exact(c)) {

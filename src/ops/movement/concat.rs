@@ -3,7 +3,7 @@
 use crate::ops::Tile;
 use crate::ops::support::put::put_run;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
-use crate::tensor::simd::{self, copy_run};
+use crate::tensor::simd::copy_run;
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
 /// Concatenation along dimension `axis`, in which alone the parts may differ.
@@ -58,7 +58,7 @@ impl<T: Float> Op<T> for Concat {
                 return;
             }
             parallel::for_each_chunk(out, tile * total, work, |i, out| {
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         let mut from = 0;
@@ -89,7 +89,7 @@ impl<T: Float> Op<T> for Concat {
                 }
                 parallel::for_each_chunk(out, tile * run, work, |i, out| {
                     let g = g.data()[i * tile * total..].chunks_exact(total);
-                    simd::dispatch(
+                    T::dispatch(
                         #[inline(always)]
                         || {
                             for (d, g) in out.chunks_exact_mut(run).zip(g) {

@@ -11,7 +11,7 @@ use crate::ops::support::put::put;
 use crate::ops::support::sums::add_sums;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply, apply1};
 use crate::tensor::pool::Buffer;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
 pub use crate::ops::support::epilogue::Activation;
 
@@ -74,7 +74,7 @@ fn statistics<T: Float>(x: &[T], c: usize, tile: usize) -> (Vec<f64>, Vec<f64>) 
         let share = T::ONE / T::of((x.len() / c) as f64);
         let (mean, squares) = part.split_at_mut(c);
         let (mut sums, mut centre) = (Buffer::<T>::stale(width), Buffer::<T>::stale(width));
-        simd::dispatch(
+        T::dispatch(
             #[inline(always)]
             || {
                 sums.fill(T::ZERO);
@@ -167,7 +167,7 @@ fn normalise_with<T: Float>(s: &Saved<T>, act: impl Function, tile: usize) -> Te
         let work = 4 * out.len();
         parallel::for_each_chunk(out, chunk, work, |i, out| {
             let x = &s.x.data()[i * chunk..][..out.len()];
-            simd::dispatch(
+            T::dispatch(
                 #[inline(always)]
                 || {
                     for (out, x) in out.chunks_mut(lanes.width).zip(x.chunks(lanes.width)) {
@@ -242,7 +242,7 @@ fn parameter_gradients<T: Float>(
         let (x, g) = (&x[i * chunk..end], &g[i * chunk..end]);
         let (mut plain, mut centred) = (Buffer::<T>::stale(width), Buffer::<T>::stale(width));
         let (dbias, dweight) = part.split_at_mut(c);
-        simd::dispatch(
+        T::dispatch(
             #[inline(always)]
             || {
                 plain.fill(T::ZERO);
@@ -286,7 +286,7 @@ fn input_gradient<T: Float>(
     let work = 6 * out.len();
     parallel::for_each_chunk(out, chunk, work, |i, out| {
         let (x, g) = (&x[i * chunk..][..out.len()], &g[i * chunk..][..out.len()]);
-        simd::dispatch(
+        T::dispatch(
             #[inline(always)]
             || {
                 for (out, (x, g)) in out.chunks_mut(width).zip(x.chunks(width).zip(g.chunks(width))) {

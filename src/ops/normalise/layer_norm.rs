@@ -8,8 +8,7 @@ use crate::ops::support::put::put;
 use crate::ops::support::sums::{add_sums, sum_of_pairs};
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::pool::Buffer;
-use crate::tensor::simd::dispatch_vector;
-use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
 /// `y = (x - mean) / sqrt(var + eps) * weight + bias`, mean and biased variance of each row of x [.., C] (Ba, Kiros and
 /// Hinton, 1607.06450).
@@ -74,7 +73,7 @@ impl<T: Float> WithSimd for Moments<'_, T> {
 fn moments<T: Float>(x: &[T], c: usize, eps: T) -> Vec<[T; 2]> {
     let mut out = vec![[T::ZERO; 2]; x.len() / c];
     if !out.is_empty() {
-        dispatch_vector(Moments { x, eps, out: &mut out });
+        T::dispatch(Moments { x, eps, out: &mut out });
     }
     out
 }
@@ -106,7 +105,7 @@ impl<T: Float> Op<T> for LayerNorm {
             parallel::for_each_chunk(out, chunk, work, |i, out| {
                 let x = &x.data()[i * chunk..][..out.len()];
                 let moments = moments(x, c, eps);
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         let rows = x.chunks_exact(c).zip(&moments);
@@ -136,7 +135,7 @@ impl<T: Float> Op<T> for LayerNorm {
             parallel::for_each_chunk(out, chunk, work, |i, out| {
                 let (x, g) = (&x.data()[i * chunk..][..out.len()], &g.data()[i * chunk..][..out.len()]);
                 let (mut products, moments) = (Buffer::<T>::stale(c), moments(x, c, eps));
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         let rows = x.chunks_exact(c).zip(g.chunks_exact(c)).zip(&moments);
@@ -160,7 +159,7 @@ impl<T: Float> Op<T> for LayerNorm {
             let (x, g) = (&x.data()[i * chunk..end], &g.data()[i * chunk..end]);
             let (dweight, dbias) = part.split_at_mut(c);
             let moments = moments(x, c, eps);
-            simd::dispatch(
+            T::dispatch(
                 #[inline(always)]
                 || {
                     dweight.fill(T::ZERO);

@@ -10,7 +10,7 @@ use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::tensor::gemm::Rows;
 use crate::tensor::pool::Buffer;
 use crate::tensor::register_tile::Panels;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime, simd};
+use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime};
 
 /// Linear layer: `y [.., out] = x [.., in] w [in, out] (+ b [out])`. A 1x1 convolution is the same thing.
 #[derive(Clone, Copy, Debug, Default)]
@@ -24,7 +24,7 @@ pub struct Linear {
 
 /// `to = gelu(from)`.
 fn gelu<T: Float>(to: &mut [T], from: &[T]) {
-    simd::dispatch(
+    T::dispatch(
         #[inline(always)]
         || to.iter_mut().zip(from).for_each(|(t, &x)| *t = Gelu.f(x)),
     );
@@ -67,7 +67,7 @@ fn input_gradient_of_gelu<T: Float>(out: &mut [T], accum: Accum, x: &[T], dy: Ro
         let mut dh = Buffer::stale(out.len());
         product(&mut dh, Accum::Replace, dy.rows(i * tile, rows), &panels);
         let terms = dh.iter().zip(&x[i * tile * k..]);
-        simd::dispatch(
+        T::dispatch(
             #[inline(always)]
             || put(accum, out.iter_mut().zip(terms).map(|(d, (&dh, &x))| (d, dh * Gelu.df(x)))),
         );

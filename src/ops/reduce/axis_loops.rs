@@ -8,7 +8,7 @@ use crate::ops::support::axes::cut;
 use crate::ops::support::put::put;
 use crate::ops::support::sums::sum_rows;
 use crate::tensor::pool::Buffer;
-use crate::tensor::{Accum, Float, Shape, parallel, regime, simd};
+use crate::tensor::{Accum, Float, Shape, parallel, regime};
 
 /// A shape cut in three by a run of dimensions.
 #[derive(Clone, Copy, Debug)]
@@ -72,7 +72,7 @@ impl Blocks {
         let work = 8 * self.outer * self.len();
         parallel::for_each_chunk(out, group * piece, work, |i, out| {
             let mut scratch = Buffer::stale(scratch);
-            simd::dispatch(
+            T::dispatch(
                 #[inline(always)]
                 || {
                     for (k, out) in out.chunks_exact_mut(piece).enumerate() {

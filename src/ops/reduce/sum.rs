@@ -6,7 +6,7 @@ use crate::ops::support::put::{begin_sum, put};
 use crate::ops::support::sums::sum_rows;
 use crate::ops::{Case, Checked, Input, Needs, Op, Registered, ShapeError, apply, apply1};
 use crate::tensor::pool::Buffer;
-use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime, simd};
+use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime};
 
 /// The sum over a run of dimensions `first..first + count`, times a factor (one over their size makes a mean).
 /// The dimensions are dropped.
@@ -65,7 +65,7 @@ impl<T: Float> Op<T> for Sum {
             let pieces = out.chunks_mut(n * inner).zip(g.data().chunks(inner));
             let pieces = pieces.flat_map(|(out, g)| out.chunks_mut(tile * inner).map(move |out| (out, g)));
             parallel::for_each_piece(pieces, work, |(out, g)| {
-                simd::dispatch(
+                T::dispatch(
                     #[inline(always)]
                     || {
                         for out in out.chunks_mut(inner) {

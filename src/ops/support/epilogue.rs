@@ -6,7 +6,7 @@ use crate::ops::Case;
 pub(in crate::ops) use crate::ops::elementwise::unary::{Elu, Hardswish, Relu};
 use crate::ops::elementwise::unary::{Function, Unary};
 use crate::tensor::pool::Buffer;
-use crate::tensor::{Float, Tensor, parallel, regime, simd};
+use crate::tensor::{Float, Tensor, parallel, regime};
 
 /// Makes everything that has a line for each activation: the enum, and the two macros that go through it. A new
 /// activation is a [`Function`] and its line in the list below: its variant, that function, its name, and what it adds
@@ -148,7 +148,7 @@ fn scale_by_derivative<T: Float>(f: impl Function, kept: &Tensor<T>, dy: &mut Te
     let (chunk, work) = (regime::size(CHUNK), 4 * dy.len());
     parallel::for_each_chunk(dy, chunk, work, |i, dy| {
         let kept = &kept.data()[i * chunk..][..dy.len()];
-        simd::dispatch(
+        T::dispatch(
             #[inline(always)]
             || dy.iter_mut().zip(kept).for_each(|(d, &k)| *d *= f.df(k)),
         );
@@ -181,7 +181,7 @@ impl<T: Float> Finish<T> {
     }
 
     fn run_with(&self, y: &mut [T], f: impl Function) {
-        simd::dispatch(
+        T::dispatch(
             #[inline(always)]
             || match &self.bias {
                 None => y.iter_mut().for_each(|y| *y = f.f(*y)),

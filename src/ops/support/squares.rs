@@ -1,7 +1,7 @@
 //! Squares of pixels, each of which saw the same pixel of a smaller image: the sum of what they have.
 
 use super::put::{begin_sum, put};
-use crate::tensor::{Accum, Float, parallel, simd};
+use crate::tensor::{Accum, Float, parallel};
 
 /// The sum of each square of `s` x `s` pixels of g, for an image of `w` squares a row with `c` channels.
 pub(in crate::ops) fn sum_squares<T: Float>(out: &mut [T], accum: Accum, g: &[T], [w, c]: [usize; 2], s: usize) {
@@ -11,7 +11,7 @@ pub(in crate::ops) fn sum_squares<T: Float>(out: &mut [T], accum: Accum, g: &[T]
     }
     parallel::for_each_unit(out, w * c, g.len(), |i, out| {
         let g = &g[i * s * row..][..s * row];
-        simd::dispatch(
+        T::dispatch(
             #[inline(always)]
             || {
                 if s == 2 {

@@ -3,7 +3,7 @@
 
 use super::put::put_rounded;
 use crate::tensor::gemm::Rows;
-use crate::tensor::{Accum, Float, GradSink, Tensor, parallel, regime, simd};
+use crate::tensor::{Accum, Float, GradSink, Tensor, parallel, regime};
 
 /// Sums in blocks, and the blocks in pairs: the error grows with the logarithm of the length.
 pub(in crate::ops) fn pairwise_sum<T: Float>(x: &[T]) -> T {
@@ -25,7 +25,7 @@ pub(in crate::ops) fn pairwise_sum<T: Float>(x: &[T]) -> T {
 
 /// The sum of the rows of a matrix, in blocks that are then summed in pairs.
 pub(in crate::ops) fn sum_rows<T: Float>(out: &mut [T], x: &[T]) {
-    simd::dispatch(
+    T::dispatch(
         #[inline(always)]
         || sum_rows_here(out, x),
     );
@@ -69,7 +69,7 @@ pub(in crate::ops) fn sum_into<T: Float>(out: &mut [T], accum: Accum, parts: &[T
     parallel::for_each_chunk(out, chunk, work, |i, out| {
         let range = i * chunk..i * chunk + out.len();
         let mut parts = parts.iter().map(|part| &part.data()[range.clone()]);
-        simd::dispatch(
+        T::dispatch(
             #[inline(always)]
             || {
                 if accum == Accum::Replace {

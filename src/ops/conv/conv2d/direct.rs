@@ -12,7 +12,7 @@ use super::parts::{Part, copy_pixels};
 use crate::ops::support::epilogue::Finish;
 use crate::tensor::pool::Buffer;
 use crate::tensor::register_tile::{Gram, Line, Panels, Product};
-use crate::tensor::{Accum, Float, parallel, simd};
+use crate::tensor::{Accum, Float, parallel};
 
 /// The rows of one image that some rows of the output see, with their padding.
 pub(in crate::ops) struct Band<T: Float> {
@@ -30,7 +30,7 @@ impl<T: Float> Band<T> {
         let line = cells * c;
         let mut data = Buffer::stale(height * line);
         let inside = g.padding[1].min(cells)..(g.padding[1] + width).min(cells);
-        simd::dispatch(
+        T::dispatch(
             #[inline(always)]
             || {
                 for (i, out) in data.chunks_exact_mut(line.max(1)).enumerate() {

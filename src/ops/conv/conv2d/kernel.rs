@@ -9,7 +9,7 @@ use crate::ops::support::sums::sum_into;
 use crate::tensor::gemm::{Rows, RowsMut, gemm};
 use crate::tensor::pool::Buffer;
 use crate::tensor::simd::copy_run;
-use crate::tensor::{Accum, Float, Tensor, parallel, regime, simd};
+use crate::tensor::{Accum, Float, Tensor, parallel, regime};
 
 /// Fills the im2col rows of the output pixels of row `oy`, for one group: `[out width, patch]`.
 fn im2col<T: Float>(g: &Geometry, image: &[T], oy: usize, group: usize, patches: &mut [T]) {
@@ -17,7 +17,7 @@ fn im2col<T: Float>(g: &Geometry, image: &[T], oy: usize, group: usize, patches:
     let run = kw * cg;
     // Where runs are whole: no dilation along the row, and all channels.
     let whole = if g.dilation[1] == 1 && g.groups == 1 { g.inside() } else { 0..0 };
-    simd::dispatch(
+    T::dispatch(
         #[inline(always)]
         || {
             for ky in 0..g.kernel[0] {

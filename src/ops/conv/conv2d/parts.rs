@@ -1,9 +1,9 @@
 //! An image in parts: what concatenation along the channels would copy together, read where it lies.
 
 use super::geometry::Geometry;
+use crate::tensor::Float;
 use crate::tensor::pool::Buffer;
 use crate::tensor::simd::copy_run;
-use crate::tensor::{Float, simd};
 
 /// Some channels of an image of the batch, `[batch, height, width, channels]`.
 #[derive(Clone, Copy)]
@@ -46,7 +46,7 @@ pub(super) fn in_one_piece<'a, T: Float>(
     }
     let pixels = g.batch * g.size[0] * g.size[1];
     let room = room.insert(Buffer::stale(pixels * g.channels));
-    simd::dispatch(
+    T::dispatch(
         #[inline(always)]
         || copy_pixels(room, parts, 0, pixels),
     );

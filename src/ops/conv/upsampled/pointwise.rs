@@ -6,7 +6,7 @@ use crate::ops::support::epilogue::Finish;
 use crate::ops::support::put::put_run;
 use crate::ops::support::{row_products, squares};
 use crate::tensor::gemm::Rows;
-use crate::tensor::{Accum, Float, Tensor, parallel, simd};
+use crate::tensor::{Accum, Float, Tensor, parallel};
 
 /// `out = x w` in squares, or added to what is there; and finished.
 pub(super) fn convolve<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: Rows<T>, w: &[T], finish: &Finish<T>) {
@@ -20,7 +20,7 @@ pub(super) fn convolve<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: R
     }
     parallel::for_each_unit(out, 4 * line, work, |i, out| {
         let products = &products.data()[i * line..][..line];
-        simd::dispatch(
+        T::dispatch(
             #[inline(always)]
             || {
                 for out in out.chunks_exact_mut(2 * line) {

@@ -13,7 +13,7 @@ use crate::ops::support::epilogue::Finish;
 use crate::ops::support::sums::sum_into;
 use crate::tensor::pool::Buffer;
 use crate::tensor::register_tile::{Gram, Line, Panels, Product};
-use crate::tensor::{Accum, Float, Tensor, parallel, simd};
+use crate::tensor::{Accum, Float, Tensor, parallel};
 
 /// The places in a square, (row, column).
 pub(super) const PHASES: [[usize; 2]; 4] = [[0, 0], [0, 1], [1, 0], [1, 1]];
@@ -37,7 +37,7 @@ fn for_each_tap([py, px]: [usize; 2], mut f: impl FnMut(usize, usize)) {
 
 #[inline(always)]
 fn add<T: Float>(out: &mut [T], w: &[T]) {
-    simd::dispatch(
+    T::dispatch(
         #[inline(always)]
         || out.iter_mut().zip(w).for_each(|(o, &w)| *o += w),
     );
