@@ -206,7 +206,10 @@ fn show(event: &Event, progress: &mut Progress, stop: &Stop) {
                 progress.say(&format!("  step {step}: mean error {error:.2} pixels"));
             }
         }
+        // The state was saved: a run that ends here validates when it is resumed.
+        Event::Validating => stop.waits.store(false, Ordering::SeqCst),
         Event::Step(r) => {
+            stop.waits.store(true, Ordering::SeqCst);
             progress.set(r.step, &format!("loss {:.4} warped {:.4} (unwarped {:.4})", r.loss, r.warped, r.unwarped));
         }
         Event::Validated(v) => {

@@ -2,6 +2,9 @@
 
 use std::sync::Arc;
 
+use std::sync::atomic::AtomicBool;
+use std::sync::atomic::Ordering::Relaxed;
+
 use crate::nn::{Identity, Params, same_model};
 use crate::tensor::{Float, Tensor, parallel, regime};
 
@@ -47,13 +50,20 @@ impl<T: Float> AdamW<T> {
     }
 
     /// One step. `gradients` are in the order of the parameters; `group` gives each parameter's settings by its name.
+    /// Returns whether all weights that it changed are finite.
     ///
     /// # Panics
     /// If the parameters are not those of the model that it was made for: names the first that differs. If a gradient
     /// has another shape than its parameter.
-    pub fn step(&mut self, params: &mut Params<T>, gradients: &[Option<Tensor<T>>], group: impl Fn(&str) -> Group) {
+    pub fn step(
+        &mut self,
+        params: &mut Params<T>,
+        gradients: &[Option<Tensor<T>>],
+        group: impl Fn(&str) -> Group,
+    ) -> bool {
         same_model("AdamW", &self.identities, &params.identities());
         self.steps += 1;
+        let finite = AtomicBool::new(true);
         let [b1, b2] = self.betas;
         let correct = |b: f64| 1.0 - b.powi(self.steps.min(i32::MAX as u64) as i32);
         let (root2, eps) = (T::of(correct(b2).sqrt()), T::of(self.eps));
@@ -72,18 +82,25 @@ impl<T: Float> AdamW<T> {
             let pieces = weights.data_mut().chunks_mut(chunk).zip(g.data().chunks(chunk));
             let pieces = pieces.zip(m.data_mut().chunks_mut(chunk).zip(v.data_mut().chunks_mut(chunk)));
             parallel::for_each_piece(pieces, 8 * g.len(), |((w, g), (m, v))| {
-                T::dispatch(
+                let all_finite = T::dispatch(
                     #[inline(always)]
                     || {
+                        let mut all_finite = true;
                         for ((w, &g), (m, v)) in w.iter_mut().zip(g).zip(m.iter_mut().zip(v)) {
                             *m = b1 * *m + c1 * g;
                             *v = b2 * *v + c2 * (g * g);
                             *w = *w * keep - rate * *m / (v.sqrt() / root2 + eps);
+                            all_finite &= w.is_finite();
                         }
+                        all_finite
                     },
                 );
+                if !all_finite {
+                    finite.store(false, Relaxed);
+                }
             });
         }
+        finite.into_inner()
     }
 }
 
@@ -108,5 +125,15 @@ mod tests {
         let w = params.get(id).value.data();
         assert!((w[0] - (0.95 - 0.1)).abs() < 1e-6 && (w[1] - (0.95 + 0.1)).abs() < 1e-6, "{w:?}");
         assert_eq!(params.get(idle).value.item(), 1.0, "no gradient, no step, no decay");
+    }
+
+    #[test]
+    fn a_weight_that_is_not_finite_is_told() {
+        let mut params = Params::<f64>::new();
+        Builder::new(&mut params, &mut Random::new(0, 0)).param("w", [40], Layout::Same, Init::Constant(1.0));
+        let mut adamw = AdamW::new(&params);
+        let gradients = [Some(Tensor::full([40], 1.0))];
+        assert!(adamw.step(&mut params, &gradients, |_| Group { learning_rate: 0.1, decay: 0.5 }));
+        assert!(!adamw.step(&mut params, &gradients, |_| Group { learning_rate: f64::MAX, decay: 10.0 }));
     }
 }

@@ -8,6 +8,7 @@ use std::fs;
 use std::path::Path;
 use std::time::Instant;
 
+use super::data::bytes_held;
 use super::recipe::RunConfig;
 use super::trainer::Trainer;
 use crate::data::batch::Batch;
@@ -102,31 +103,33 @@ impl Cost {
     }
 }
 
-/// Makes sure that a training step fits into the memory that is free now, as far as the system says how much that is.
+/// Makes sure that a training step, and the pictures that are held meanwhile, fit into the memory that is free now, as far as the system says how much that is.
 ///
 /// # Errors
 /// If it does not: both figures, and what makes it smaller.
 pub fn check_memory(config: &RunConfig) -> Result<()> {
     let Some(free) = free_memory() else { return Ok(()) };
     // No network of this crate comes near this for a pixel, and none has as many parameters: not worth counting.
-    if MOST_PARAMETERS + MOST_A_PIXEL * (config.batch * config.height * config.width) as f64 <= free {
+    let held = bytes_held(config);
+    if held + MOST_PARAMETERS + MOST_A_PIXEL * (config.batch * config.height * config.width) as f64 <= free {
         return Ok(());
     }
     let cost = Cost::of(&config.ablation.apply(config.preset.config()), [config.height, config.width], config.batch)?;
-    if cost.bytes_step <= free {
+    let needed = held + cost.bytes_step;
+    if needed <= free {
         return Ok(());
     }
     let gib = |bytes: f64| bytes / f64::from(1 << 30);
     Err(Error::setting(
         "batch",
         format!(
-            "a training step of {} at {}x{}, batch {}, needs about {:.1} GiB, and {:.1} GiB are free: take a smaller \
+            "training {} at {}x{}, batch {}, needs about {:.1} GiB, and {:.1} GiB are free: take a smaller \
              batch, smaller pictures or a smaller preset",
             config.preset.name(),
             config.width,
             config.height,
             config.batch,
-            gib(cost.bytes_step),
+            gib(needed),
             gib(free)
         ),
     ))

@@ -37,6 +37,12 @@ pub fn open(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) +
     Ok(data)
 }
 
+/// The bytes of pictures that are held in memory while a run goes on: all of the street's, none of a folder's.
+pub(super) fn bytes_held(config: &RunConfig) -> f64 {
+    let frames = if config.data == STREET { SEQUENCES.iter().sum::<usize>() * FRAMES } else { 0 };
+    3.0 * (frames * config.height * config.width) as f64
+}
+
 fn street(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + Sync)) -> RunData {
     let RunConfig { height, width, seed, .. } = *config;
     let street = |what: &'static str, sequences: usize, seed: u64| {

@@ -57,6 +57,8 @@ pub enum Event<'a> {
     Rotations(u64, f64),
     /// A step is done.
     Step(&'a StepReport),
+    /// A checkpoint was saved; its weights are validated next.
+    Validating,
     /// Weights were validated.
     Validated(&'a Validation),
     /// Something could not be measured, and why; training goes on.
@@ -243,6 +245,7 @@ impl Run {
                     self.leave_weights()?;
                     return Ok(Ended::Interrupted(report.step));
                 }
+                tell(Event::Validating);
                 self.validate(data, &validation, &mut log, &mut tell)?;
                 since = Instant::now();
             }

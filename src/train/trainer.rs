@@ -124,7 +124,8 @@ impl Trainer {
     /// One step: forward, backward, AdamW.
     ///
     /// # Errors
-    /// If the loss or a gradient is not finite: the step, and the op that first made such a number. Nothing is changed.
+    /// If the loss or a gradient is not finite: the step, and the op that first made such a number; nothing is changed.
+    /// If a weight is not finite after the step: its name; that weight is lost.
     pub fn step(&mut self, batch: &Batch) -> Result<StepReport> {
         let step = self.adamw.steps + 1;
         let tape = Tape::new();
@@ -164,7 +165,9 @@ impl Trainer {
             };
             Group { learning_rate: learning_rates[which], decay }
         };
-        profile::phase("adamw", || self.adamw.step(&mut self.params, &gradients, group));
+        if !profile::phase("adamw", || self.adamw.step(&mut self.params, &gradients, group)) {
+            self.check_finite()?;
+        }
         profile::phase("running statistics", || {
             for (id, value) in moved {
                 self.params.set(id, value);

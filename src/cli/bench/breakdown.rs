@@ -95,7 +95,7 @@ mod tests {
 
     #[test]
     fn the_rows_of_a_training_step_add_up_to_the_traced_total() {
-        let mut network = Network::new(&PICO, true).expect("sizes that fit");
+        let mut network = Network::new(&PICO, 0, true).expect("sizes that fit");
         let profiles = [(); 2].map(|()| {
             let (done, profile) = profile::profile(|| network.once());
             done.expect("a step");
@@ -124,7 +124,7 @@ mod tests {
 
     #[test]
     fn an_inference_has_no_backward_pass() {
-        let mut network = Network::new(&PICO, false).expect("sizes that fit");
+        let mut network = Network::new(&PICO, 0, false).expect("sizes that fit");
         let profiles = measure(&mut network, 1, true).expect("an inference").profiles;
         let rows = rows(&profiles);
         assert!(rows.len() > 10);

@@ -14,6 +14,7 @@ use parallax::train::RunConfig;
 use parallax::train::Trainer;
 
 use super::Sizes;
+use crate::cli::progress::Progress;
 
 /// Something that can be done again and again.
 pub trait Job {
@@ -41,7 +42,9 @@ pub fn measure(job: &mut impl Job, iterations: usize, listen: bool) -> Result<Me
     job.once()?;
     let mut fresh = 0;
     let (mut seconds, mut profiles) = (Vec::new(), Vec::new());
-    for _ in 0..iterations.max(1) {
+    let iterations = iterations.max(1);
+    let mut progress = Progress::new("timing", iterations as u64);
+    for done in 1..=iterations {
         let before = pool::fresh_buffers();
         let start = Instant::now();
         job.once()?;
@@ -52,7 +55,9 @@ pub fn measure(job: &mut impl Job, iterations: usize, listen: bool) -> Result<Me
             done?;
             profiles.push(profile);
         }
+        progress.set(done as u64, "");
     }
+    progress.finish();
     let fresh_buffers = fresh as f64 / seconds.len() as f64;
     Ok(Measured { seconds, profiles, forward_flops: warm.ops.iter().map(|e| e.flops).sum(), fresh_buffers })
 }
@@ -67,15 +72,16 @@ pub struct Network {
 
 impl Network {
     /// The network of the given sizes, with a batch.
-    pub fn new(sizes: &Sizes, step: bool) -> Result<Self> {
+    pub fn new(sizes: &Sizes, seed: u64, step: bool) -> Result<Self> {
         sizes.check()?;
         let mut config = RunConfig::new(sizes.preset, 1_000_000);
         // The step as it is for most of the run.
         config.auto_mask_delay = 0.0;
         config.rotations.keep = 0.0;
+        config.seed = seed;
         let trainer = Trainer::new(config.model(), config.plan());
         let folded = (!step).then(|| Folded::new(&trainer.params));
-        Ok(Network { trainer, batch: batch(sizes), folded })
+        Ok(Network { trainer, batch: batch(sizes, seed), folded })
     }
 }
 
@@ -114,8 +120,8 @@ impl Job for Conv {
 }
 
 /// Triplets of smooth random pictures.
-fn batch(sizes: &Sizes) -> Batch {
-    let mut random = Random::new(1, 0);
+fn batch(sizes: &Sizes, seed: u64) -> Batch {
+    let mut random = Random::new(seed.wrapping_add(1), 0);
     let mut picture = |scale: usize| {
         let (h, w) = (sizes.height >> scale, sizes.width >> scale);
         let coarse: Tensor<f32> = Tensor::build([sizes.batch, h.div_ceil(8), w.div_ceil(8), 3], |out| {

@@ -54,6 +54,9 @@ struct Counted {
     /// Number of timed iterations, after three that are not counted.
     #[arg(long, value_name = "N", default_value_t = 10)]
     iterations: usize,
+    /// Seed of the weights and of the pictures.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
 }
 
 #[derive(clap::Args)]
@@ -93,7 +96,7 @@ pub fn run(args: Args) -> Result<()> {
     match args.what {
         What::Step(timed) => time_network(&timed, true),
         What::Infer(timed) => time_network(&timed, false),
-        What::Roofline(counted) => roofline::run(&counted.sizes, counted.iterations),
+        What::Roofline(counted) => roofline::run(&counted),
         What::Conv { iterations, json } => {
             report(&timing(job::measure(&mut Conv::new(), iterations, false)?, false)?, json)
         }
@@ -102,7 +105,7 @@ pub fn run(args: Args) -> Result<()> {
 }
 
 fn time_network(Timed { counted, no_breakdown }: &Timed, step: bool) -> Result<()> {
-    let mut network = Network::new(&counted.sizes, step)?;
+    let mut network = Network::new(&counted.sizes, counted.seed, step)?;
     let measured = job::measure(&mut network, counted.iterations, !no_breakdown)?;
     report(&timing(measured, step)?, counted.sizes.json)
 }

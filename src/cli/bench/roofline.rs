@@ -15,7 +15,7 @@ use serde::Serialize;
 
 use super::breakdown::{self, Row};
 use super::job::{self, Network};
-use super::{Sizes, median};
+use super::{Counted, median};
 
 /// What this machine can do, on the threads that there are.
 #[derive(Clone, Copy, Debug, Serialize)]
@@ -60,10 +60,10 @@ struct Roofline {
     passes: Vec<Pass>,
 }
 
-pub fn run(sizes: &Sizes, iterations: usize) -> Result<()> {
-    let mut network = Network::new(sizes, true)?;
+pub fn run(Counted { sizes, iterations, seed }: &Counted) -> Result<()> {
+    let mut network = Network::new(sizes, *seed, true)?;
     let ceilings = Ceilings { gemm_gflops: gemm_ceiling(), memory_gbs: memory_ceiling() };
-    let measured = job::measure(&mut network, iterations, true)?;
+    let measured = job::measure(&mut network, *iterations, true)?;
     let rows = breakdown::rows(&measured.profiles);
     let mut passes: Vec<Pass> = rows.iter().flat_map(|row| passes(row, ceilings)).collect();
     passes.sort_by(|a, b| b.milliseconds.total_cmp(&a.milliseconds));

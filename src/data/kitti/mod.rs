@@ -265,8 +265,13 @@ impl Kitti {
                 self.left_out.without_depth += 1;
                 continue;
             }
-            self.check_truth(frame).map_err(|e| at(e.to_string()))?;
-            self.samples.push(frame);
+            match self.check_truth(frame) {
+                Ok(()) => self.samples.push(frame),
+                Err(error) if self.options.skip_bad_frames => {
+                    self.unreadable.push((self.name_of(frame), error.to_string()));
+                }
+                Err(error) => return Err(at(error.to_string())),
+            }
         }
         let Some((number, missing)) = lacking else {
             return match (self.samples.is_empty(), self.unreadable.first()) {
@@ -302,15 +307,13 @@ impl Kitti {
                         self.left_out.without_depth += 1;
                         self.left_out.first_depth.get_or_insert(missing);
                     } else {
-                        if let Err(error) = self.check_pictures(frame, &mut checked) {
-                            if !self.options.skip_bad_frames {
-                                return Err(error);
+                        match self.check_pictures(frame, &mut checked).and_then(|()| self.check_truth(frame)) {
+                            Ok(()) => self.samples.push(frame),
+                            Err(error) if self.options.skip_bad_frames => {
+                                self.unreadable.push((self.name_of(frame), error.to_string()));
                             }
-                            self.unreadable.push((self.name_of(frame), error.to_string()));
-                            continue;
+                            Err(error) => return Err(error),
                         }
-                        self.check_truth(frame)?;
-                        self.samples.push(frame);
                     }
                 }
             }

@@ -162,6 +162,26 @@ fn frames_that_cannot_be_read_are_left_out_if_they_may_be() {
 }
 
 #[test]
+fn ground_truth_that_cannot_be_read_is_left_out_with_its_frame() {
+    let root = made_up(3..9);
+    let depth = DepthMap { width: 3, height: 2, metres: vec![1.0; 6] };
+    let path = |frame: u32| root.path().join(format!("day/drive/proj_depth/groundtruth/image_02/{frame:010}.png"));
+    for frame in [4, 5] {
+        write_depth_png(path(frame), &depth).unwrap();
+    }
+    fs::write(path(6), b"no picture").unwrap();
+    let improved = Options { ground_truth: GroundTruth::Improved, ..TARGET_ONLY };
+    let skipping = Options { skip_bad_frames: true, ..improved };
+    for lines in [Some("day/drive 4 l\nday/drive 5 l\nday/drive 6 l"), None] {
+        assert!(message(open(root.path(), lines, improved)).contains("0000000006.png"));
+        let kitti = open(root.path(), lines, skipping).unwrap();
+        assert_eq!(names(&kitti), ["day/drive 4 l", "day/drive 5 l"]);
+        let [(name, why)] = kitti.unreadable() else { panic!("{:?}", kitti.unreadable()) };
+        assert!(name == "day/drive 6 l" && why.contains("0000000006.png"), "{name}: {why}");
+    }
+}
+
+#[test]
 fn a_picture_that_is_cut_is_an_error_with_its_path() {
     let root = made_up(3..7);
     let path = root.path().join("day/drive/image_02/data/0000000005.png");
