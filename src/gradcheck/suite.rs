@@ -6,17 +6,16 @@ use std::sync::{Mutex, PoisonError};
 
 use serde::Serialize;
 
-use super::{Gradients, Measured, Options, Report, cotangents, differences, draw, options_of};
+use super::outcome::{leaves, outcome, same};
+use super::{Gradients, Measured, Options, Pieces, Report, SIZES, cotangents, differences, draw, options_of};
 use crate::ops::Op;
 use crate::ops::case::Fill;
 use crate::ops::registry::{AnyCase, Entry};
+use crate::tensor::regime::Cut;
 use crate::tensor::{Tape, Tensor, Var, parallel, pool};
 
-/// Outputs, and the gradients of the tracked inputs.
-type Outcome = (Vec<Tensor<f64>>, Vec<Option<Tensor<f64>>>);
-
-/// The seed of inputs and cotangents.
-const SEED: u64 = 1;
+/// What a case gives in f64.
+type Outcome = super::outcome::Outcome<f64>;
 
 /// A case with its inputs, and what is known of it so far.
 pub struct Subject<'a> {
@@ -28,24 +27,25 @@ pub struct Subject<'a> {
     pub options: Options,
     /// Which inputs are differentiated.
     pub all: Vec<bool>,
+    seed: u64,
     measured: OnceCell<Measured>,
     first: OnceCell<Outcome>,
 }
 
 impl<'a> Subject<'a> {
-    /// A case with inputs of its own.
-    pub fn new(case: &'a dyn AnyCase) -> Self {
-        let options = options_of(case, SEED);
+    /// A case with inputs and cotangents from a seed.
+    pub fn new(case: &'a dyn AnyCase, seed: u64) -> Self {
+        let options = options_of(case, seed);
         let all = (0..case.inputs().len()).map(|i| !options.constant.contains(&i)).collect();
-        let inputs = draw(case, SEED);
-        Subject { case, inputs, options, all, measured: OnceCell::new(), first: OnceCell::new() }
+        let inputs = draw(case, seed);
+        Subject { case, inputs, options, all, seed, measured: OnceCell::new(), first: OnceCell::new() }
     }
 
     /// The same inputs to another op with the same forward pass, whose finite differences are known therefore.
     pub fn altered<'b>(&self, case: &'b dyn AnyCase) -> Subject<'b> {
         let measured = OnceCell::from(self.measured().clone());
         let (inputs, options, all) = (self.inputs.clone(), self.options.clone(), self.all.clone());
-        Subject { case, inputs, options, all, measured, first: OnceCell::new() }
+        Subject { case, inputs, options, all, seed: self.seed, measured, first: OnceCell::new() }
     }
 
     /// What it is called in messages.
@@ -59,7 +59,12 @@ impl<'a> Subject<'a> {
 
     /// The op's outputs and gradients, the first time.
     pub fn first(&self) -> &Outcome {
-        self.first.get_or_init(|| outcome(self.case, &self.inputs, &self.all))
+        self.first.get_or_init(|| self.outcome(&self.inputs, &self.all))
+    }
+
+    fn outcome(&self, inputs: &[Tensor<f64>], tracked: &[bool]) -> Outcome {
+        let run = |vars: &[&Var<f64>]| self.case.run(vars);
+        outcome(&run, inputs, tracked, &|outputs| cotangents(outputs, self.seed), None)
     }
 
     /// The finite differences.
@@ -75,7 +80,7 @@ impl<'a> Subject<'a> {
     /// The gradients as the checker takes them.
     pub fn gradients(&self) -> Gradients {
         let vars = leaves(&Tape::new(), &self.inputs, &self.all);
-        let cotangents = cotangents(&self.run(&vars), SEED);
+        let cotangents = cotangents(&self.run(&vars), self.seed);
         let zero = |(i, g): (usize, &Option<Tensor<f64>>)| {
             self.all[i].then(|| g.clone().unwrap_or_else(|| Tensor::zeros(*self.inputs[i].shape())))
         };
@@ -88,43 +93,11 @@ impl<'a> Subject<'a> {
     }
 }
 
-fn leaves(tape: &Tape<f64>, inputs: &[Tensor<f64>], tracked: &[bool]) -> Vec<Var<f64>> {
-    let leaf = |(x, &on): (&Tensor<f64>, &bool)| if on { tape.leaf(x.clone()) } else { Var::constant(x.clone()) };
-    inputs.iter().zip(tracked).map(leaf).collect()
-}
-
-fn outcome(case: &dyn AnyCase, inputs: &[Tensor<f64>], tracked: &[bool]) -> Outcome {
-    let tape = Tape::new();
-    let vars = leaves(&tape, inputs, tracked);
-    let outputs = case.run(&vars.iter().collect::<Vec<_>>());
-    let cotangents = cotangents(&outputs, SEED);
-    let seeds: Vec<_> = outputs.iter().zip(cotangents).filter_map(|(y, c)| Some((y, c?))).collect();
-    let mut gradients = tape.backward(&seeds);
-    let gradients = vars.iter().map(|v| gradients.take(v)).collect();
-    (outputs.into_iter().map(Var::into_value).collect(), gradients)
-}
-
-fn same(a: &Outcome, b: &Outcome) -> Result<(), String> {
-    for (i, (x, y)) in a.0.iter().zip(&b.0).enumerate() {
-        if !x.same_bits(y) {
-            return Err(format!("output {i} differs"));
-        }
-    }
-    for (i, (x, y)) in a.1.iter().zip(&b.1).enumerate() {
-        if let (Some(x), Some(y)) = (x, y)
-            && !x.same_bits(y)
-        {
-            return Err(format!("the gradient of input {i} differs"));
-        }
-    }
-    Ok(())
-}
-
 /// A check: what is wrong, if anything is.
 pub type Check = fn(&Subject) -> Result<(), String>;
 
 /// All of them.
-pub const CHECKS: [(&str, Check); 9] = [
+pub const CHECKS: [(&str, Check); 10] = [
     ("differences", against_differences),
     ("promises", keeps_its_promise),
     ("accumulation", adds_to_what_is_there),
@@ -133,6 +106,7 @@ pub const CHECKS: [(&str, Check); 9] = [
     ("again", is_the_same_again),
     ("threads", is_the_same_on_one_and_two_threads),
     ("poison", is_the_same_over_poisoned_memory),
+    ("zeros", is_the_same_over_poisoned_memory_at_zeros),
     ("single", is_nearly_the_same_in_single_precision),
 ];
 
@@ -161,8 +135,9 @@ fn adds_to_what_is_there(s: &Subject) -> Result<(), String> {
     let tape = Tape::new();
     let vars = leaves(&tape, &s.inputs, &s.all);
     let outputs = s.run(&vars);
-    let mut seeds: Vec<_> = outputs.iter().zip(cotangents(&outputs, SEED)).filter_map(|(y, c)| Some((y, c?))).collect();
-    let elsewhere = cotangents(&vars, SEED + 1);
+    let mut seeds: Vec<_> =
+        outputs.iter().zip(cotangents(&outputs, s.seed)).filter_map(|(y, c)| Some((y, c?))).collect();
+    let elsewhere = cotangents(&vars, s.seed + 1);
     seeds.extend(vars.iter().zip(&elsewhere).filter_map(|(x, c)| Some((x, c.clone()?))));
     let mut together = tape.backward(&seeds);
     for (i, (x, elsewhere)) in vars.iter().zip(&elsewhere).enumerate() {
@@ -186,13 +161,13 @@ fn adds_up_over_several_places(s: &Subject) -> Result<(), String> {
             }
             let mut numbers = s.inputs.clone();
             numbers[i] = numbers[j].clone();
-            let apart = outcome(s.case, &numbers, &s.all).1;
+            let apart = s.outcome(&numbers, &s.all).1;
             let tape = Tape::new();
             let mut vars = leaves(&tape, &numbers, &s.all);
             vars[i] = vars[j].clone();
             let outputs = s.run(&vars);
             let seeds: Vec<_> =
-                outputs.iter().zip(cotangents(&outputs, SEED)).filter_map(|(y, c)| Some((y, c?))).collect();
+                outputs.iter().zip(cotangents(&outputs, s.seed)).filter_map(|(y, c)| Some((y, c?))).collect();
             let Some(together) = tape.backward(&seeds).take(&vars[j]) else { continue };
             for (k, &g) in together.data().iter().enumerate() {
                 let sum: f64 = [i, j].iter().filter_map(|&i| apart[i].as_ref()).map(|g| g.data()[k]).sum();
@@ -213,7 +188,7 @@ fn is_the_same_for_every_subset_of_tracked_inputs(s: &Subject) -> Result<(), Str
         if !tracked.contains(&true) {
             continue;
         }
-        let part = outcome(s.case, &s.inputs, &tracked);
+        let part = s.outcome(&s.inputs, &tracked);
         same(s.first(), &part).map_err(|why| format!("{why} where {tracked:?} are tracked"))?;
         for (i, (gradient, &on)) in part.1.iter().zip(&tracked).enumerate() {
             if gradient.is_some() != (on && s.first().1[i].is_some()) {
@@ -225,12 +200,12 @@ fn is_the_same_for_every_subset_of_tracked_inputs(s: &Subject) -> Result<(), Str
 }
 
 fn is_the_same_again(s: &Subject) -> Result<(), String> {
-    same(s.first(), &outcome(s.case, &s.inputs, &s.all))
+    same(s.first(), &s.outcome(&s.inputs, &s.all))
 }
 
 fn is_the_same_on_one_and_two_threads(s: &Subject) -> Result<(), String> {
     for threads in [1, 2] {
-        let again = parallel::with_threads(threads, || outcome(s.case, &s.inputs, &s.all));
+        let again = parallel::with_threads(threads, || s.outcome(&s.inputs, &s.all));
         same(s.first(), &again).map_err(|why| format!("{why} on {threads} threads"))?;
     }
     Ok(())
@@ -255,7 +230,7 @@ fn poisoned(s: &Subject, inputs: &[Tensor<f64>]) -> Outcome {
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
     let _clean = Clean;
     pool::set_poison(true);
-    outcome(s.case, inputs, &s.all)
+    s.outcome(inputs, &s.all)
 }
 
 /// The same where numbers are exactly zero: loops that skip zeros leave what they should have written.
@@ -266,7 +241,7 @@ fn is_the_same_over_poisoned_memory_at_zeros(s: &Subject) -> Result<(), String> 
             x.data_mut().iter_mut().step_by(2).for_each(|x| *x = 0.0);
         }
     }
-    let clean = || outcome(s.case, &inputs, &s.all);
+    let clean = || s.outcome(&inputs, &s.all);
     let (once, again, over_nan) = (clean(), clean(), poisoned(s, &inputs));
     same(&once, &again).and_then(|()| same(&once, &over_nan)).map_err(|why| format!("{why} where inputs are zero"))
 }
@@ -275,7 +250,7 @@ fn is_the_same_over_poisoned_memory_at_zeros(s: &Subject) -> Result<(), String> 
 fn is_nearly_the_same_in_single_precision(s: &Subject) -> Result<(), String> {
     let single: Vec<Tensor<f32>> = s.inputs.iter().map(Tensor::cast).collect();
     let rounded: Vec<Tensor<f64>> = single.iter().map(Tensor::cast).collect();
-    let double = outcome(s.case, &rounded, &s.all);
+    let double = s.outcome(&rounded, &s.all);
     let tape = Tape::new();
     let leaf = |(x, &on): (&Tensor<f32>, &bool)| if on { tape.leaf(x.clone()) } else { Var::constant(x.clone()) };
     let vars: Vec<Var<f32>> = single.iter().zip(&s.all).map(leaf).collect();
@@ -283,7 +258,7 @@ fn is_nearly_the_same_in_single_precision(s: &Subject) -> Result<(), String> {
     for (i, (y, exact)) in outputs.iter().zip(&double.0).enumerate() {
         close(y.value(), exact).map_err(|why| format!("output {i}, {why}"))?;
     }
-    let seeds64 = cotangents(&s.run(&leaves(&Tape::new(), &rounded, &s.all)), SEED);
+    let seeds64 = cotangents(&s.run(&leaves(&Tape::new(), &rounded, &s.all)), s.seed);
     let seeds: Vec<_> = outputs.iter().zip(&seeds64).filter_map(|(y, c)| Some((y, c.as_ref()?.cast()))).collect();
     let gradients = tape.backward(&seeds);
     for (i, (v, exact)) in vars.iter().zip(&double.1).enumerate() {
@@ -313,10 +288,45 @@ pub struct Complaint {
     pub case: &'static str,
     /// The kernel path.
     pub algo: &'static str,
-    /// The check, by its name in [`CHECKS`] (or `zeros`).
+    /// The check, by its name in [`CHECKS`] or [`Found`](super::Found).
     pub check: &'static str,
     /// What is wrong.
     pub why: String,
+}
+
+/// What all checks of one case found.
+pub struct Verdict {
+    /// The comparison with finite differences.
+    pub report: Report,
+    /// The cuts of all runs with small pieces.
+    pub cuts: Vec<Cut>,
+    /// How many sizes of pieces cut anything.
+    pub sizes: usize,
+    /// What is wrong.
+    pub complaints: Vec<Complaint>,
+}
+
+/// Every check of one case: those of [`CHECKS`], and those of [`Pieces`] with pieces of each of [`SIZES`].
+pub fn check_everything(case: &dyn AnyCase, seed: u64) -> Verdict {
+    let subject = Subject::new(case, seed);
+    let mut complaints = Vec::new();
+    let mut complain = |check, why| complaints.push(Complaint { case: case.name(), algo: case.algo(), check, why });
+    for (name, check) in CHECKS {
+        if let Err(why) = check(&subject) {
+            complain(name, why);
+        }
+    }
+    let pieces = Pieces::new(&subject);
+    let (mut cuts, mut sizes) = (Vec::new(), 0);
+    for size in SIZES {
+        let found = pieces.check(size);
+        sizes += usize::from(found.cuts.iter().any(|cut| cut.pieces > 1));
+        cuts.extend(found.cuts);
+        for (check, why) in found.complaints {
+            complain(check, format!("with pieces of {size}: {why}"));
+        }
+    }
+    Verdict { report: subject.report(), cuts, sizes, complaints }
 }
 
 /// What [`check_op`] found.
@@ -349,21 +359,14 @@ impl fmt::Display for OpReport {
 
 /// Holds an op to everything that the ops of this crate are held to, on its own cases: finite differences, what it adds
 /// to gradients that are there already, one value as several inputs, subsets of tracked inputs, repetition, threads,
-/// memory full of NaN (also where inputs are zero), f32 against f64.
+/// memory full of NaN (also where inputs are zero), f32 against f64; and all of it with small pieces of work, if the op cuts
+/// its work at [`regime::size`](crate::tensor::regime::size).
 ///
 /// The poison of memory is a switch of the whole process: an op that runs on another thread meanwhile and reads what it
 /// did not write sees NaN, too.
 pub fn check_op<O: Op<f64> + Op<f32>>() -> OpReport {
     let entry = Entry::of::<O>();
     let cases = entry.cases();
-    let mut complaints = Vec::new();
-    for case in &cases {
-        let subject = Subject::new(case.as_ref());
-        let zeros: (&str, Check) = ("zeros", is_the_same_over_poisoned_memory_at_zeros);
-        for (check, run) in CHECKS.into_iter().chain([zeros]) {
-            let why = run(&subject).err();
-            complaints.extend(why.map(|why| Complaint { case: case.name(), algo: case.algo(), check, why }));
-        }
-    }
+    let complaints = cases.iter().flat_map(|case| check_everything(case.as_ref(), 1).complaints).collect();
     OpReport { op: entry.name, cases: cases.len(), complaints }
 }

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use super::op::{Needs, Op, ShapeError};
 use crate::tensor::profile::{self, Entry, Work};
+use crate::tensor::regime;
 use crate::tensor::tape::Backward;
 use crate::tensor::{Float, GradSink, Shape, Tape, Tensor, Upstream, Var};
 
@@ -37,6 +38,7 @@ pub(super) fn execute<T: Float, O: Op<T>>(op: O, inputs: &[&Var<T>]) -> Result<V
 trait Node<T: Float> {
     fn outputs(&self, inputs: &[Shape]) -> Result<Vec<Shape>, ShapeError>;
     fn auxiliary(&self) -> usize;
+    fn algo(&self, inputs: &[Shape]) -> &'static str;
     fn entry(&self, inputs: &[Shape], outputs: &[Shape], needs: &Needs) -> Entry;
     fn compute(&self, inputs: &[&Tensor<T>], needs: &Needs) -> (Vec<Tensor<T>>, Option<Backward<T>>);
 }
@@ -48,10 +50,13 @@ impl<T: Float, O: Op<T>> Node<T> for O {
     fn auxiliary(&self) -> usize {
         Op::auxiliary(self)
     }
+    fn algo(&self, inputs: &[Shape]) -> &'static str {
+        Op::algo(self, inputs)
+    }
     fn entry(&self, inputs: &[Shape], outputs: &[Shape], needs: &Needs) -> Entry {
         let (flops, traffic) = (self.flops(inputs), self.traffic(inputs, outputs, needs));
         let traffic = traffic.map(|elements| elements * size_of::<T>() as u64);
-        entry((O::NAME, self.algo(inputs)), [inputs, outputs], needs, flops, traffic)
+        entry((O::NAME, Op::algo(self, inputs)), [inputs, outputs], needs, flops, traffic)
     }
     fn compute(&self, inputs: &[&Tensor<T>], needs: &Needs) -> (Vec<Tensor<T>>, Option<Backward<T>>) {
         let (outputs, saved) = self.forward(inputs, needs);
@@ -63,7 +68,7 @@ impl<T: Float, O: Op<T>> Node<T> for O {
     }
 }
 
-fn node<T: Float>(name: &str, op: &dyn Node<T>, inputs: &[&Var<T>]) -> Result<Vec<Var<T>>, String> {
+fn node<T: Float>(name: &'static str, op: &dyn Node<T>, inputs: &[&Var<T>]) -> Result<Vec<Var<T>>, String> {
     let shapes: Vec<Shape> = inputs.iter().map(|v| *v.shape()).collect();
     let expected = op.outputs(&shapes).map_err(|why| format!("{name}: {why} (inputs {shapes:?})"))?;
     let tape = common_tape::<T>(name, inputs)?;
@@ -71,7 +76,8 @@ fn node<T: Float>(name: &str, op: &dyn Node<T>, inputs: &[&Var<T>]) -> Result<Ve
     let values: Vec<&Tensor<T>> = inputs.iter().map(|v| v.value()).collect();
 
     let running = profile::begin_forward(|| op.entry(&shapes, &expected, &needs));
-    let (mut outputs, backward) = op.compute(&values, &needs);
+    let label = regime::label(|| (name, op.algo(&shapes)));
+    let (mut outputs, backward) = regime::of_op(label, || op.compute(&values, &needs));
     let place = profile::end_forward(running, &outputs);
 
     debug_assert!(outputs.iter().map(Tensor::shape).eq(&expected), "{name}: the shape rule says {expected:?}");
@@ -81,7 +87,7 @@ fn node<T: Float>(name: &str, op: &dyn Node<T>, inputs: &[&Var<T>]) -> Result<Ve
             let slots = inputs.iter().map(|v| v.slot()).collect();
             let timed = move |upstream: Upstream<T>, sink: &mut GradSink<'_, T>| {
                 let running = profile::begin_backward(place);
-                backward(upstream, sink);
+                regime::of_op(label, || backward(upstream, sink));
                 profile::end_backward(running);
             };
             tape.record(slots, outputs, Box::new(timed))

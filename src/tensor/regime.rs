@@ -6,7 +6,7 @@
 //! it small ([`shrink`]), and every cut is noted with its place in the source for whoever listens ([`record`]): the suite
 //! sees which cuts its cases crossed, and refuses those that none did.
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::ops::Range;
 use std::panic::Location;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
@@ -29,19 +29,47 @@ pub fn shrink(largest: usize) {
     LARGEST.store(largest, Relaxed);
 }
 
-/// One cut that a kernel made: its place in the source, and how many pieces there were.
+/// One cut that a kernel made: whose kernel, its place in the source, and how many pieces there were.
 #[derive(Clone, Copy, Debug)]
 pub struct Cut {
+    /// The op, forward or backward; empty outside of one.
+    pub op: &'static str,
+    /// Its kernel path.
+    pub algo: &'static str,
     /// The call that cut.
-    pub place: &'static Location<'static>,
+    pub location: &'static Location<'static>,
     /// Number of pieces.
     pub pieces: usize,
     /// Whether the last piece was shorter than the others, where that is known.
     pub rest: Option<bool>,
 }
 
+impl Cut {
+    /// File, below `src`, and line.
+    pub fn place(&self) -> String {
+        let file = self.location.file();
+        format!("{}:{}", file.rsplit_once("src/").map_or(file, |(_, file)| file), self.location.line())
+    }
+}
+
 thread_local! {
     static CUTS: RefCell<Option<Vec<Cut>>> = const { RefCell::new(None) };
+    /// The op that runs on this thread, and its kernel path.
+    static RUNNING: Cell<(&'static str, &'static str)> = const { Cell::new(("", "")) };
+}
+
+/// The op that is about to run, if anybody wants to know whose cuts are made.
+pub(crate) fn label(what: impl FnOnce() -> (&'static str, &'static str)) -> Option<(&'static str, &'static str)> {
+    CUTS.with_borrow(Option::is_some).then(what)
+}
+
+/// Runs an op, whose cuts bear its label.
+pub(crate) fn of_op<R>(label: Option<(&'static str, &'static str)>, run: impl FnOnce() -> R) -> R {
+    let Some(label) = label else { return run() };
+    let before = RUNNING.replace(label);
+    let result = run();
+    RUNNING.set(before);
+    result
 }
 
 /// Runs `f`, and returns the cuts that kernels made meanwhile on this thread: all of them, if kernels run on one
@@ -53,10 +81,11 @@ pub fn record<R>(f: impl FnOnce() -> R) -> (R, Vec<Cut>) {
 }
 
 /// Notes a cut.
-pub(crate) fn note(place: &'static Location<'static>, pieces: usize, rest: Option<bool>) {
+pub(crate) fn note(location: &'static Location<'static>, pieces: usize, rest: Option<bool>) {
     CUTS.with_borrow_mut(|cuts| {
         if let Some(cuts) = cuts {
-            cuts.push(Cut { place, pieces, rest });
+            let (op, algo) = RUNNING.get();
+            cuts.push(Cut { op, algo, location, pieces, rest });
         }
     });
 }
@@ -66,6 +95,7 @@ pub(crate) fn note(place: &'static Location<'static>, pieces: usize, rest: Optio
 pub mod mutants {
     use std::panic::Location;
     use std::sync::Mutex;
+    use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
     /// What goes wrong at the cut.
     #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -87,6 +117,17 @@ pub mod mutants {
         pub const ALL: [Bug; 5] =
             [Bug::DropsLast, Bug::DropsBeyondSecond, Bug::ReadsPrevious, Bug::ReadsFirst, Bug::DropsLastInSingle];
 
+        /// What it is called in tables.
+        pub fn name(self) -> &'static str {
+            match self {
+                Bug::DropsLast => "drops the last",
+                Bug::DropsBeyondSecond => "drops beyond the second",
+                Bug::ReadsPrevious => "reads the previous",
+                Bug::ReadsFirst => "reads the first",
+                Bug::DropsLastInSingle => "drops the last in f32",
+            }
+        }
+
         /// The piece that is computed in the place of piece `i` of `count`, if one is.
         pub(crate) fn instead(self, i: usize, count: usize, single: bool) -> Option<usize> {
             match self {
@@ -100,17 +141,31 @@ pub mod mutants {
         }
     }
 
-    static PLANTED: Mutex<Option<(&'static str, u32, Bug)>> = Mutex::new(None);
+    static PLANTED: Mutex<Option<(String, u32, Bug)>> = Mutex::new(None);
+    /// The number of the formula that is wrong, and 1; none if 0.
+    static FORMULA: AtomicUsize = AtomicUsize::new(0);
 
-    /// Plants a bug at a cut (the end of its file's path, and its line), or takes it away.
-    pub fn plant(bug: Option<(&'static str, u32, Bug)>) {
+    /// Makes a formula of the list wrong, or all right.
+    pub fn plant_formula(number: Option<usize>) {
+        FORMULA.store(number.map_or(0, |n| n + 1), Relaxed);
+    }
+
+    /// Whether a formula is the one that is wrong.
+    #[inline(always)]
+    pub fn formula(number: usize) -> bool {
+        FORMULA.load(Relaxed) == number + 1
+    }
+
+    /// Plants a bug at a cut (file and line), or takes it away.
+    pub fn plant(bug: Option<(String, u32, Bug)>) {
         *PLANTED.lock().expect("no panic holds this lock") = bug;
     }
 
     /// The bug at a place.
     pub(crate) fn at(place: &Location) -> Option<Bug> {
-        let planted = *PLANTED.lock().expect("no panic holds this lock");
-        planted.filter(|(file, line, _)| place.file().ends_with(file) && place.line() == *line).map(|(_, _, bug)| bug)
+        let planted = PLANTED.lock().expect("no panic holds this lock");
+        let (file, line, bug) = planted.as_ref()?;
+        (place.line() == *line && place.file() == file).then_some(*bug)
     }
 }
 
@@ -139,7 +194,7 @@ mod tests {
         let (found, cuts) = record(|| blocks(3..13, 4).collect::<Vec<_>>());
         assert_eq!(found, [3..7, 7..11, 11..13]);
         assert_eq!((cuts.len(), cuts[0].pieces, cuts[0].rest), (1, 3, Some(true)));
-        assert!(cuts[0].place.file().ends_with("regime.rs"));
+        assert!(cuts[0].place().starts_with("tensor/regime.rs:"));
         assert_eq!(blocks(5..5, 4).count(), 0);
         let (_, cuts) = record(|| blocks(0..8, 4).count());
         assert_eq!((cuts[0].pieces, cuts[0].rest), (2, Some(false)));

@@ -226,7 +226,7 @@ fn every_planted_bug_is_noticed() {
     for mutant in bugs::ALL {
         let mut noticed = vec![false; CHECKS.len()];
         for (case, real) in planted(mutant) {
-            let real = Subject::new(real.as_ref());
+            let real = Subject::new(real.as_ref(), 1);
             let subject = real.altered(&case);
             for (noticed, (_, check)) in noticed.iter_mut().zip(CHECKS) {
                 *noticed |= check(&subject).is_err();

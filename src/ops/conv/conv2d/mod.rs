@@ -333,7 +333,7 @@ impl Checked for Conv2d {
             parts("parts, dilated along the row", dilated, [2, 5, 6], &[1, 2], [3, 3, 3, 2], true),
             parts("parts, dilated down the columns", tall, [2, 5, 4], &[1, 2], [3, 1, 3, 2], false),
             parts("parts, 1x1", Conv2d::default(), [2, 3, 4], &[3, 1, 2], [1, 1, 6, 3], true),
-            parts("parts, 1x1, without bias", Conv2d::default(), [5, 6, 10], &[3, 8], [1, 1, 11, 17], false),
+            parts("parts, 1x1, without bias", Conv2d::default(), [1, 5, 6], &[3, 8], [1, 1, 11, 17], false),
             parts("parts, stride 2 of 1x1", Conv2d::default().strided(2), [2, 5, 4], &[1, 2], [1, 1, 3, 2], true),
             parts("parts, side by side", same, [2, 3, 6], &[1, 1], [3, 3, 2, 16], true),
             parts("parts, tile and one", Conv2d { tile: Tile::of(4), ..same }, [1, 5, 3], &[1, 2], [3, 3, 3, 2], false),
