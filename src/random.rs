@@ -147,6 +147,24 @@ impl Random {
         radius * (std::f64::consts::TAU * self.unit()).cos()
     }
 
+    /// One of some items.
+    ///
+    /// # Panics
+    /// If there is none.
+    pub fn pick<T: Copy>(&mut self, items: &[T]) -> T {
+        items[self.below(items.len())]
+    }
+
+    /// A whole number from `low` to `high`, half of the time one of the two: combinations of extremes are where loops
+    /// go wrong.
+    pub fn extreme(&mut self, low: usize, high: usize) -> usize {
+        match self.below(4) {
+            0 => low,
+            1 => high,
+            _ => low + self.below(high - low + 1),
+        }
+    }
+
     /// Puts a slice in random order (Fisher-Yates).
     pub fn shuffle<T>(&mut self, items: &mut [T]) {
         for i in (1..items.len()).rev() {

@@ -1,10 +1,11 @@
 //! `parallax gradcheck`.
 
 use std::collections::BTreeMap;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
-use parallax::gradcheck::{CHECKS, Complaint, Regimes, check_everything};
+use parallax::gradcheck::{CHECKS, Complaint, Regimes, Subject, check_everything};
 use parallax::ops::registry::{self, Entry};
+use parallax::random::{Random, Stream};
 use parallax::{Error, Result};
 use serde::Serialize;
 
@@ -18,6 +19,9 @@ pub struct Args {
     /// Seed of inputs and cotangents.
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
+    /// Then draw cases from the ranges of every op's attributes, for an hour.
+    #[arg(long)]
+    thorough: bool,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
@@ -43,6 +47,8 @@ struct Table {
     ops: Vec<Row>,
     /// What was done with each case.
     checks: Vec<&'static str>,
+    /// Cases that were drawn at random.
+    drawn: usize,
     /// Places in the source at which work was cut.
     places: usize,
     /// What is wrong, check by check.
@@ -65,13 +71,16 @@ pub fn run(args: Args) -> Result<()> {
     }
     let began = Instant::now();
     let checks = CHECKS.iter().map(|(name, _)| *name).collect();
-    let mut table = Table { ops: Vec::new(), checks, places: 0, complaints: Vec::new() };
+    let mut table = Table { ops: Vec::new(), checks, drawn: 0, places: 0, complaints: Vec::new() };
     let (mut regimes, mut progress) = (Regimes::default(), Progress::new("ops", chosen.len() as u64));
     for (done, entry) in chosen.iter().enumerate() {
         table.ops.extend(rows(entry, args.seed, &mut regimes, &mut table.complaints));
         progress.set(done as u64 + 1, entry.name);
     }
     progress.finish();
+    if args.thorough {
+        table.drawn = drawn(&chosen, args.seed, &mut table.complaints);
+    }
     table.places = regimes.places();
     for Wrong { op, complaint: Complaint { case, algo, check, why } } in &table.complaints {
         note!("{op} [{algo}] \"{case}\", {check}: {why}\n");
@@ -92,7 +101,7 @@ fn rows(entry: &Entry, seed: u64, regimes: &mut Regimes, wrong: &mut Vec<Wrong>)
     let mut rows: BTreeMap<&str, Row> = BTreeMap::new();
     for case in entry.cases() {
         let start = Instant::now();
-        let found = check_everything(case.as_ref(), seed);
+        let found = check_everything(&Subject::new(case.as_ref(), seed));
         regimes.add(&found.cuts);
         let (op, algo) = (entry.name, case.algo());
         let none =
@@ -108,6 +117,32 @@ fn rows(entry: &Entry, seed: u64, regimes: &mut Regimes, wrong: &mut Vec<Wrong>)
         wrong.extend(found.complaints.into_iter().map(|complaint| Wrong { op, complaint }));
     }
     rows.into_values().collect()
+}
+
+/// How long cases are drawn.
+const THOROUGH: Duration = Duration::from_secs(3600);
+
+/// Checks cases that nobody listed, of one op after the other, until the time is up; how many.
+fn drawn(entries: &[Entry], seed: u64, wrong: &mut Vec<Wrong>) -> usize {
+    note!("drawing cases for an hour, from seed {seed}");
+    let (began, mut random, mut count) = (Instant::now(), Random::of(seed, Stream::CaseInputs), 0);
+    let mut progress = Progress::new("minutes", THOROUGH.as_secs() / 60);
+    while began.elapsed() < THOROUGH {
+        let before = count;
+        for entry in entries {
+            let Some(case) = entry.draw(&mut random) else { continue };
+            count += 1;
+            let found = check_everything(&Subject::drawn(case.as_ref(), seed.wrapping_add(count as u64)));
+            wrong.extend(found.complaints.into_iter().map(|complaint| Wrong { op: entry.name, complaint }));
+            progress.set(began.elapsed().as_secs() / 60, &format!("{count} cases"));
+        }
+        if count == before {
+            note!("none of these ops has attributes to draw");
+            break;
+        }
+    }
+    progress.finish();
+    count
 }
 
 fn print(table: &Table, began: Instant) {
@@ -150,5 +185,8 @@ fn print(table: &Table, began: Instant) {
         table.places,
         sum(|r| r.cut)
     );
+    if table.drawn > 0 {
+        say!("{} more cases were drawn", table.drawn);
+    }
     say!("{} checks failed", table.complaints.len());
 }

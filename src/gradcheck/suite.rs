@@ -7,7 +7,7 @@ use std::sync::{Mutex, PoisonError};
 use serde::Serialize;
 
 use super::outcome::{leaves, outcome, same};
-use super::{Gradients, Measured, Options, Pieces, Report, SIZES, cotangents, differences, draw, options_of};
+use super::{Gradients, Kinks, Measured, Options, Pieces, Report, SIZES, cotangents, differences, draw, options_of};
 use crate::ops::Op;
 use crate::ops::case::Fill;
 use crate::ops::registry::{AnyCase, Entry};
@@ -39,6 +39,15 @@ impl<'a> Subject<'a> {
         let all = (0..case.inputs().len()).map(|i| !options.constant.contains(&i)).collect();
         let inputs = draw(case, seed);
         Subject { case, inputs, options, all, seed, measured: OnceCell::new(), first: OnceCell::new() }
+    }
+
+    /// A case that was drawn ([`Entry::draw`]): nobody has looked at how many numbers sit on a kink, and whether an input
+    /// has no say.
+    pub fn drawn(case: &'a dyn AnyCase, seed: u64) -> Self {
+        let mut subject = Self::new(case, seed);
+        subject.options.kinks = Kinks::Any;
+        subject.options.ignored = (0..case.inputs().len()).collect();
+        subject
     }
 
     /// The same inputs to another op with the same forward pass, whose finite differences are known therefore.
@@ -307,16 +316,16 @@ pub struct Verdict {
 }
 
 /// Every check of one case: those of [`CHECKS`], and those of [`Pieces`] with pieces of each of [`SIZES`].
-pub fn check_everything(case: &dyn AnyCase, seed: u64) -> Verdict {
-    let subject = Subject::new(case, seed);
+pub fn check_everything(subject: &Subject) -> Verdict {
+    let case = subject.case;
     let mut complaints = Vec::new();
     let mut complain = |check, why| complaints.push(Complaint { case: case.name(), algo: case.algo(), check, why });
     for (name, check) in CHECKS {
-        if let Err(why) = check(&subject) {
+        if let Err(why) = check(subject) {
             complain(name, why);
         }
     }
-    let pieces = Pieces::new(&subject);
+    let pieces = Pieces::new(subject);
     let (mut cuts, mut sizes) = (Vec::new(), 0);
     for size in SIZES {
         let found = pieces.check(size);
@@ -367,6 +376,7 @@ impl fmt::Display for OpReport {
 pub fn check_op<O: Op<f64> + Op<f32>>() -> OpReport {
     let entry = Entry::of::<O>();
     let cases = entry.cases();
-    let complaints = cases.iter().flat_map(|case| check_everything(case.as_ref(), 1).complaints).collect();
+    let complaints =
+        cases.iter().flat_map(|case| check_everything(&Subject::new(case.as_ref(), 1)).complaints).collect();
     OpReport { op: entry.name, cases: cases.len(), complaints }
 }

@@ -1,5 +1,7 @@
 //! Gradient-check cases: an op, its attributes, and what its inputs are filled with.
 
+use std::fmt;
+
 use crate::random::{Random, Stream};
 use crate::tensor::{Shape, Tensor};
 
@@ -191,6 +193,17 @@ impl<O> Case<O> {
     /// A case at the usual tolerance.
     pub fn new(name: &'static str, op: O, inputs: impl Into<Vec<Input>>) -> Self {
         Case { op, terms: Terms::new(name, inputs.into()) }
+    }
+
+    /// A case that was drawn: its name says what.
+    pub fn drawn(op: O, inputs: impl Into<Vec<Input>>) -> Self
+    where
+        O: fmt::Debug,
+    {
+        let inputs = inputs.into();
+        let shapes: Vec<Shape> = inputs.iter().map(|input| input.shape).collect();
+        // Names live as long as the program; there are some thousands of these at most.
+        Self::new(format!("{op:?} of {shapes:?}").leak(), op, inputs)
     }
 
     /// Allows a larger error, for a reason that is printed.

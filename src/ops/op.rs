@@ -4,6 +4,7 @@ use std::fmt;
 
 use super::apply::execute;
 use super::case::Case;
+use crate::random::Random;
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 
 /// A differentiable function of tensors: its shape rule, its forward pass, its gradient, and (by [`Checked`]) the
@@ -153,6 +154,13 @@ impl<O: CustomOp> Registered for O {
 pub trait Checked: Sized {
     /// Inputs on which the gradient is compared with finite differences: every kernel path, every input perturbed.
     fn cases() -> Vec<Case<Self>>;
+
+    /// A case with attributes and sizes drawn from their ranges, more often than not at an end of them: how the
+    /// combinations that nobody listed are checked. One that the op's shape rule refuses is drawn again. `None` for an op
+    /// of which there is nothing to combine.
+    fn draw(_: &mut Random) -> Option<Case<Self>> {
+        None
+    }
 }
 
 /// Inputs whose gradients are wanted. Known in the forward pass, so that inference and frozen parts save nothing.

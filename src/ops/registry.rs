@@ -16,6 +16,7 @@ use super::op::{Op, Registered};
 use super::product::{cross, linear, matmul};
 use super::reduce::{cross_entropy, cumulative, log_softmax, log_sum_exp, norm, prod, softmax, sum, variance};
 use super::{ShapeError, apply};
+use crate::random::Random;
 use crate::tensor::{Float, Shape, Signature, Var};
 
 /// What runs an op in one element type.
@@ -135,11 +136,15 @@ registry! {
     "cross_entropy" => cross_entropy::CrossEntropy,
 }
 
+/// The most numbers in the inputs of a case that is drawn.
+const MOST_DRAWN: usize = 1000;
+
 /// One registered op: its name and its gradient-check cases.
 pub struct Entry {
     /// The name.
     pub name: &'static str,
     cases: fn() -> Vec<Box<dyn AnyCase>>,
+    draw: fn(&mut Random) -> Option<Box<dyn AnyCase>>,
 }
 
 impl Entry {
@@ -148,7 +153,24 @@ impl Entry {
         Entry {
             name: O::NAME,
             cases: || O::cases().into_iter().map(|case| Box::new(case) as Box<dyn AnyCase>).collect(),
+            draw: |random| O::draw(random).map(|case| Box::new(case) as Box<dyn AnyCase>),
         }
+    }
+
+    /// A case that nobody listed (see [`Checked::draw`](super::Checked::draw)), which the op's shape rule takes, which has
+    /// something to differentiate, and not more than finite differences can afford; `None` if the op draws none, or none
+    /// in a hundred is taken.
+    pub fn draw(&self, random: &mut Random) -> Option<Box<dyn AnyCase>> {
+        for _ in 0..100 {
+            let case = (self.draw)(random)?;
+            let shapes = case.terms().shapes();
+            let taken = case.outputs(&shapes).is_ok_and(|outputs| outputs.iter().all(|y| !y.is_empty()));
+            let elements: usize = shapes.iter().map(Shape::len).sum();
+            if taken && elements <= MOST_DRAWN && shapes.iter().all(|x| !x.is_empty()) {
+                return Some(case);
+            }
+        }
+        None
     }
 
     /// Its gradient-check cases.

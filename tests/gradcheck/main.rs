@@ -8,6 +8,7 @@
 mod ablations;
 mod catalogue;
 mod checks;
+mod drawn;
 mod every_op;
 mod model_path;
 mod mutants;

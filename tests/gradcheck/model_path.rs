@@ -27,10 +27,13 @@ fn paths(preset: Preset, height: usize, width: usize, batch: usize) -> BTreeSet<
     let batch = batch_of_step(&street, Augment::default(), batch, 0, 0).expect("a batch");
     let (step, mut entries) = profile::record(false, || trainer.step(&batch));
     step.expect("a step");
-    let lesson = || trainer.learn_rotations(|| Ok(batch.clone()), |_, _| true);
-    let (learnt, more) = profile::record(false, lesson);
-    assert!(learnt.expect("a lesson"));
-    entries.extend(more);
+    // The same networks again: once, of the one that is trained.
+    if preset == Preset::Nano {
+        let lesson = || trainer.learn_rotations(|| Ok(batch.clone()), |_, _| true);
+        let (learnt, more) = profile::record(false, lesson);
+        assert!(learnt.expect("a lesson"));
+        entries.extend(more);
+    }
     let image = street.frame(0, 1).clone();
     let predictor = Predictor::new(&trainer.model, &trainer.params, &config.setup());
     entries.extend(profile::record(false, || predictor.disparity(&image)).1);

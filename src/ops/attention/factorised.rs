@@ -4,6 +4,7 @@ use super::head_products::Heads;
 use crate::ops::Tile;
 use crate::ops::support::put::put_run;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::random::Random;
 use crate::tensor::gemm::Rows;
 use crate::tensor::pool::Buffer;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
@@ -288,6 +289,14 @@ impl Checked for FactorisedAttention {
             Case::new("one token", op(2, 0), qkv(2, 1, 4)),
             Case::new("no sample", op(2, 0), qkv(0, 3, 4)).flat(),
         ]
+    }
+
+    fn draw(random: &mut Random) -> Option<Case<Self>> {
+        let heads = random.pick(&[1, 2, 3, 8]);
+        let channels = heads * random.pick(&[1, 2, 5, 6, 8, 15, 16, 17]);
+        let qkv = [random.extreme(1, 3), random.extreme(1, 9), 3 * channels];
+        let op = FactorisedAttention { heads, tile: Tile::of(random.extreme(0, 5)) };
+        Some(Case::drawn(op, [Input::uniform("qkv", qkv, -2.0, 2.0)]))
     }
 }
 

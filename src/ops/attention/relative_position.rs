@@ -4,6 +4,7 @@ use crate::ops::Tile;
 use crate::ops::support::put::{begin_sum, put};
 use crate::ops::support::sums::add_sums;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::random::Random;
 use crate::tensor::pool::Buffer;
 use crate::tensor::simd::copy_run;
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel, simd};
@@ -486,6 +487,22 @@ impl Checked for ConvRelativePosition {
             case("tile and one", 2, [5, 2], 3, &[(3, 1)], 4),
             case("no sample", 0, [2, 2], 3, &[(3, 1)], 0).flat(),
         ]
+    }
+
+    fn draw(random: &mut Random) -> Option<Case<Self>> {
+        let count = random.extreme(1, 3);
+        let windows: Vec<(usize, usize)> =
+            (0..count).map(|_| (1 + 2 * random.extreme(0, LARGEST / 2), random.extreme(1, 3))).collect();
+        let heads = windows.iter().map(|w| w.1).sum();
+        let [height, width] = [random.extreme(1, 5), random.extreme(1, 17)];
+        let tile = Tile::of(random.extreme(0, 4));
+        let (batch, c) = (random.extreme(1, 3), random.pick(&[1, 2, 5, 8, 16]));
+        let mut inputs = vec![Input::random("qkv", [batch, height * width, 3 * c * heads])];
+        for (&(window, heads), names) in windows.iter().zip([["w0", "b0"], ["w1", "b1"], ["w2", "b2"]]) {
+            inputs.push(Input::random(names[0], [window, window, c * heads]));
+            inputs.push(Input::random(names[1], [c * heads]));
+        }
+        Some(Case::drawn(ConvRelativePosition { height, width, heads, windows, tile }, inputs))
     }
 }
 

@@ -9,6 +9,7 @@ use crate::ops::support::epilogue::Finish;
 use crate::ops::support::row_products::rows_of;
 use crate::ops::support::sums::bias_gradient;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::random::Random;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 
 /// `x [batch, height, width, in]`, `w [kh, kw, out / groups, in]`, optionally `b [out]`
@@ -238,6 +239,27 @@ impl Checked for ConvTranspose2d {
             ),
             case("empty batch", by(2), [0, 3, 2, 2], [3, 3, 3, 2], true).flat(),
         ]
+    }
+
+    fn draw(random: &mut Random) -> Option<Case<Self>> {
+        let groups = random.pick(&[1, 1, 2, 3]);
+        let kernel = [random.extreme(1, 5), random.extreme(1, 5)];
+        let stride = [random.extreme(1, 4), random.extreme(1, 4)];
+        let op = ConvTranspose2d {
+            stride,
+            padding: kernel.map(|k| random.extreme(0, k - 1)),
+            dilation: [random.extreme(1, 3), random.extreme(1, 3)],
+            output_padding: stride.map(|s| random.extreme(0, s - 1)),
+            groups,
+            tile: Tile::of(random.extreme(0, 5)),
+        };
+        let (c, out) = (groups * random.extreme(1, 4), random.extreme(1, 5));
+        let image = [random.extreme(1, 3), random.extreme(1, 5), random.extreme(1, 5), c];
+        let mut inputs = vec![Input::random("x", image), Input::random("w", [kernel[0], kernel[1], out, c])];
+        if random.coin() {
+            inputs.push(Input::random("b", [out * groups]));
+        }
+        Some(Case::drawn(op, inputs))
     }
 }
 

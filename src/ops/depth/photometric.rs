@@ -3,6 +3,7 @@
 use super::ssim::{Kernel, TILE, pair};
 use crate::ops::Tile;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::random::Random;
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 
 /// Photometric error `w mean_c clamp((1 - SSIM) / 2, 0, 1) + (1 - w) mean_c |prediction - target|` for every pixel:
@@ -88,6 +89,14 @@ impl Checked for Photometric {
                 .flat()
                 .promises(0, [0.0; 4]),
         ]
+    }
+
+    fn draw(random: &mut Random) -> Option<Case<Self>> {
+        let op = Photometric { ssim_weight: random.pick(&[0.0, 0.85, 1.0]), tile: Tile::of(random.extreme(0, 6)) };
+        let shape = [random.extreme(1, 3), random.extreme(2, 6), random.extreme(2, 7), random.pick(&[1, 2, 3, 4])];
+        let quarter = 0.25 / shape.iter().product::<usize>() as f64;
+        let prediction = Input::distinct_in("prediction", shape, 0.0, 1.0);
+        Some(Case::drawn(op, [prediction, Input::distinct_in("target", shape, quarter, 1.0 + quarter)]))
     }
 }
 

@@ -7,6 +7,7 @@
 use crate::ops::Tile;
 use crate::ops::support::put::{begin_sum, put, put_rounded};
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::random::Random;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, pool::Buffer, regime};
 
 /// Guards the division by the projected depth, as published.
@@ -509,6 +510,18 @@ impl Checked for Warp {
             of("three cameras", true, 0, [3, 4, 5, 3]),
             far,
         ]
+    }
+
+    fn draw(random: &mut Random) -> Option<Case<Self>> {
+        let [b, h, w] = [random.extreme(1, 4), random.extreme(2, 6), random.extreme(2, 9)];
+        let mut camera = |n: usize| [random.uniform(0.5, 1.5) * n as f64, random.uniform(0.3, 0.7) * n as f64];
+        let intrinsics = (0..b).map(|_| (camera(w), camera(h))).map(|([fx, cx], [fy, cy])| [fx, fy, cx, cy]).collect();
+        let op = Warp { intrinsics, consistent: random.coin(), tile: Tile::of(random.extreme(0, 6)) };
+        let unit = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0];
+        let transform: Vec<f64> = (0..b).flat_map(|_| unit).map(|x| x + random.uniform(-0.05, 0.05)).collect();
+        let source = Input::random("source", [b, h, w, random.pick(&[1, 2, 3, 5])]);
+        let depth = Input::uniform("depth", [b, h, w, 1], 2.0, 6.0);
+        Some(Case::drawn(op, [source, depth, Input::values("transform", [b, 3, 4], transform)]))
     }
 }
 

@@ -2,6 +2,7 @@
 
 use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::random::Random;
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
 /// Max pooling: the largest element of each window of each channel of [batch, height, width, channels]. Padding never
@@ -178,6 +179,13 @@ impl Checked for MaxPool2d {
             Case::new("no image", op(3, 2, 1), [x(&[0, 3, 3, 2])]).flat(),
         ]
     }
+
+    fn draw(random: &mut Random) -> Option<Case<Self>> {
+        let kernel = random.pick(&[1, 2, 3, 5, 9]);
+        let op = MaxPool2d { kernel, stride: random.extreme(1, 4), padding: random.extreme(0, kernel / 2) };
+        let image = [random.extreme(1, 3), random.extreme(1, 9), random.extreme(1, 9), random.pick(&[1, 3, 8, 17])];
+        Some(Case::drawn(op, [Input::distinct("x", image)]))
+    }
 }
 
 impl<T: Float> Op<T> for AvgPool2d {
@@ -279,6 +287,13 @@ impl Checked for AvgPool2d {
             Case::new("2 by 3, gaps", op(2, 3), [x(&[2, 5, 9, 1])]),
             Case::new("no image", op(3, 1), [x(&[0, 3, 3, 2])]).flat(),
         ]
+    }
+
+    fn draw(random: &mut Random) -> Option<Case<Self>> {
+        let kernel = random.pick(&[1, 2, 3, 5, 9]);
+        let op = AvgPool2d { kernel, stride: random.extreme(1, 4) };
+        let image = [random.extreme(1, 3), random.extreme(1, 9), random.extreme(1, 9), random.pick(&[1, 3, 8, 17])];
+        Some(Case::drawn(op, [Input::random("x", image)]))
     }
 }
 

@@ -2,6 +2,7 @@
 
 use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::random::Random;
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
 /// Reflection padding: adds rows and columns to [batch, height, width, channels], mirrored about the outermost pixels,
@@ -104,6 +105,12 @@ impl Checked for ReflectPad {
             Case::new("nothing", op([0; 4]), [x(&[2, 1, 1, 3])]),
             Case::new("no image", op([1; 4]), [x(&[0, 3, 3, 2])]).flat(),
         ]
+    }
+
+    fn draw(random: &mut Random) -> Option<Case<Self>> {
+        let [left, right, top, bottom] = [0; 4].map(|_| random.extreme(0, 5));
+        let image = [random.extreme(1, 3), random.extreme(1, 6), random.extreme(1, 6), random.pick(&[1, 3, 8, 17])];
+        Some(Case::drawn(ReflectPad { left, right, top, bottom }, [Input::random("x", image)]))
     }
 }
 

@@ -3,6 +3,7 @@
 use crate::depth::half_pixel;
 use crate::ops::support::put::begin_sum;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::random::Random;
 use crate::tensor::pool::Buffer;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime};
 
@@ -219,6 +220,16 @@ impl Checked for ResizeBilinear {
             ]);
         }
         cases
+    }
+
+    fn draw(random: &mut Random) -> Option<Case<Self>> {
+        let op = ResizeBilinear {
+            height: random.extreme(1, 11),
+            width: random.extreme(1, 11),
+            align_corners: random.coin(),
+        };
+        let image = [random.extreme(1, 3), random.extreme(1, 7), random.extreme(1, 7), random.pick(&[1, 2, 3, 17])];
+        Some(Case::drawn(op, [Input::random("x", image)]))
     }
 }
 

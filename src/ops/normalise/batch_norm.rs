@@ -10,6 +10,7 @@ use crate::ops::support::epilogue::{repeat, width, with_activation};
 use crate::ops::support::put::put;
 use crate::ops::support::sums::add_sums;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply, apply1};
+use crate::random::Random;
 use crate::tensor::pool::Buffer;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
@@ -429,6 +430,17 @@ impl Checked for BatchNorm {
             ]);
         }
         cases
+    }
+
+    fn draw(random: &mut Random) -> Option<Case<Self>> {
+        let c = random.pick(&[1, 3, 8, 17, 128]);
+        let op = BatchNorm {
+            eps: random.pick(&[1e-5, 1e-3]),
+            activation: random.pick(&Activation::ALL),
+            tile: Tile::of(random.extreme(0, 5)),
+        };
+        let x = [random.extreme(1, 4), random.extreme(2, 3), random.extreme(2, 3), c];
+        Some(Case::drawn(op, [Input::random("x", x), Input::random("weight", [c]), Input::random("bias", [c])]))
     }
 }
 

@@ -7,6 +7,7 @@ use crate::ops::Tile;
 use crate::ops::support::put::put;
 use crate::ops::support::sums::{add_sums, sum_of_pairs};
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::random::Random;
 use crate::tensor::pool::Buffer;
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
@@ -203,6 +204,13 @@ impl Checked for LayerNorm {
             Case::new("one channel: nothing varies", op(0), one_channel),
             Case::new("no rows", op(0), inputs(&[0], 3)).flat(),
         ]
+    }
+
+    fn draw(random: &mut Random) -> Option<Case<Self>> {
+        let c = random.pick(&[2, 3, 7, 16, 33]);
+        let op = LayerNorm { eps: random.pick(&[1e-5, 1e-3]), tile: Tile::of(random.extreme(0, 5)) };
+        let x = [random.extreme(1, 3), random.extreme(1, 7), c];
+        Some(Case::drawn(op, [Input::random("x", x), Input::random("weight", [c]), Input::random("bias", [c])]))
     }
 }
 

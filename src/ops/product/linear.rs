@@ -7,6 +7,7 @@ use crate::ops::support::put::put;
 use crate::ops::support::row_products::{forward, input_gradient, product, tile_rows, weight_gradient};
 use crate::ops::support::sums::bias_gradient;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::random::Random;
 use crate::tensor::gemm::Rows;
 use crate::tensor::pool::Buffer;
 use crate::tensor::register_tile::Panels;
@@ -164,6 +165,17 @@ impl Checked for Linear {
             Case::new("GELU, no rows", gelu(0), [x(&[0, 2]), w(2, 3), b(3)]).flat(),
             Case::new("no rows", tiled(0), [x(&[0, 2]), w(2, 3), b(3)]).flat(),
         ]
+    }
+
+    fn draw(random: &mut Random) -> Option<Case<Self>> {
+        let op = Linear { gelu: random.coin(), tile: Tile::of(random.extreme(0, 5)) };
+        let [k, n] = [random.pick(&[1, 2, 5, 16, 17]), random.pick(&[1, 2, 8, 17, 33])];
+        let mut inputs =
+            vec![Input::random("x", [random.extreme(1, 3), random.extreme(1, 9), k]), Input::random("w", [k, n])];
+        if random.coin() {
+            inputs.push(Input::random("b", [n]));
+        }
+        Some(Case::drawn(op, inputs))
     }
 }
 

@@ -1,6 +1,7 @@
 //! Batched matrix product.
 
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::random::Random;
 use crate::tensor::gemm::{Rows, RowsMut, gemm};
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var, parallel};
 
@@ -88,6 +89,13 @@ impl Checked for Matmul {
             case("empty batch", &[0, 2, 3], &[0, 3, 2]).flat(),
             case("no rows", &[0, 3], &[3, 2]).flat(),
         ]
+    }
+
+    fn draw(random: &mut Random) -> Option<Case<Self>> {
+        let before: Vec<usize> = (0..random.extreme(0, 2)).map(|_| random.extreme(1, 3)).collect();
+        let [m, k, n] = [0; 3].map(|_| random.pick(&[1, 2, 5, 8, 17]));
+        let shape = |last: [usize; 2]| before.iter().copied().chain(last).collect::<Vec<_>>();
+        Some(Case::drawn(Matmul, [Input::random("a", &shape([m, k])), Input::random("b", &shape([k, n]))]))
     }
 }
 

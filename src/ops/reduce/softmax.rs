@@ -3,6 +3,7 @@
 use super::axis_loops::Blocks;
 use crate::ops::support::put::put;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::random::Random;
 use crate::tensor::{Float, GradSink, Shape, Tensor, Upstream, Var};
 
 /// `y = e^(x - max) / sum e^(x - max)`, maximum and sum along an axis. Where all of them are minus infinity (or one is
@@ -116,6 +117,13 @@ impl Checked for Softmax {
             Case::new("one element", op(1), [x(&[3, 1])]).flat(),
             Case::new("nothing", op(0), [x(&[0, 2])]).flat(),
         ]
+    }
+
+    fn draw(random: &mut Random) -> Option<Case<Self>> {
+        let shape: Vec<usize> = (0..random.extreme(1, 4)).map(|_| random.extreme(1, 7)).collect();
+        let op = Softmax { axis: random.below(shape.len()) };
+        let worth = shape[op.axis] > 1;
+        worth.then(|| Case::drawn(op, [Input::uniform("x", &shape, -3.0, 3.0)])).or_else(|| Self::draw(random))
     }
 }
 

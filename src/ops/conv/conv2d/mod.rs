@@ -15,6 +15,7 @@ use crate::ops::support::epilogue::{Activation, paths};
 use crate::ops::support::row_products::{self, rows_of};
 use crate::ops::support::sums::bias_gradient;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::random::Random;
 use crate::tensor::gemm::Rows;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 use geometry::{Geometry, Path};
@@ -369,6 +370,33 @@ impl Checked for Conv2d {
             cases.push(case("activated without bias", same.activated(activation), [1, 4, 5, 3], [3, 3, 3, 2], false));
         }
         cases
+    }
+
+    fn draw(random: &mut Random) -> Option<Case<Self>> {
+        let groups = random.pick(&[1, 1, 2, 3]);
+        let (kernel, stride, dilation) = ([0; 2], [0; 2], [0; 2]);
+        let kernel = kernel.map(|_| random.pick(&[1, 2, 3, 5, 7]));
+        let op = Conv2d {
+            stride: stride.map(|_| random.extreme(1, 4)),
+            padding: kernel.map(|k| random.extreme(0, k)),
+            dilation: dilation.map(|_| random.extreme(1, 3)),
+            groups,
+            reflect: random.coin(),
+            activation: random.pick(&Activation::ALL),
+            tile: Tile::of(random.extreme(0, 5)),
+            parts: if groups == 1 { random.extreme(1, 3) } else { 1 },
+        };
+        let image = [random.extreme(1, 3), random.extreme(1, 7), random.extreme(1, 9)];
+        let channels: Vec<usize> = (0..op.parts).map(|_| groups * random.extreme(1, 5)).collect();
+        let out = groups * random.pick(&[1, 2, 3, 8, 17]);
+        let [b, h, w] = image;
+        let mut inputs: Vec<Input> =
+            ["x1", "x2", "x3"].into_iter().zip(&channels).map(|(name, &c)| Input::random(name, [b, h, w, c])).collect();
+        inputs.push(Input::random("w", [kernel[0], kernel[1], channels.iter().sum::<usize>() / groups, out]));
+        if random.coin() {
+            inputs.push(Input::random("b", [out]));
+        }
+        Some(Case::drawn(op, inputs))
     }
 }
 

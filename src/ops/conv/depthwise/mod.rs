@@ -7,6 +7,7 @@ use crate::ops::Tile;
 use crate::ops::support::epilogue::{Activation, paths};
 use crate::ops::support::sums::bias_gradient;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::random::Random;
 use crate::tensor::gemm::{Rows, RowsMut};
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 
@@ -161,6 +162,23 @@ impl Checked for DepthwiseConv2d {
             ]);
         }
         cases
+    }
+
+    fn draw(random: &mut Random) -> Option<Case<Self>> {
+        let kernel = random.pick(&[1, 3, 5, 7]);
+        let op = DepthwiseConv2d {
+            stride: random.extreme(1, 3),
+            padding: random.extreme(0, kernel),
+            tile: Tile::of(random.extreme(0, 5)),
+            activation: random.pick(&Activation::ALL),
+        };
+        let channels = random.pick(&[1, 3, 8, 16, 17, 33]);
+        let image = [random.extreme(1, 3), random.extreme(1, 6), random.extreme(1, 9), channels];
+        let mut inputs = vec![Input::random("x", image), Input::random("w", [kernel, kernel, channels])];
+        if random.coin() {
+            inputs.push(Input::random("b", [channels]));
+        }
+        Some(Case::drawn(op, inputs))
     }
 }
 

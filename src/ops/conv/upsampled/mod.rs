@@ -16,6 +16,7 @@ use crate::ops::support::put::put_run;
 use crate::ops::support::row_products::{self, rows_of};
 use crate::ops::support::sums::bias_gradient;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
+use crate::random::Random;
 use crate::tensor::gemm::Rows;
 use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
 
@@ -307,6 +308,23 @@ impl Checked for UpsampledConv2d {
             cases.push(case("1x1, activated", op, [2, 1, 2, 2], &[3], [1, 3], true));
         }
         cases
+    }
+
+    fn draw(random: &mut Random) -> Option<Case<Self>> {
+        let parts = random.extreme(0, 2);
+        let op =
+            UpsampledConv2d { parts, tile: Tile::of(random.extreme(0, 5)), activation: random.pick(&Activation::ALL) };
+        let [b, h, w, c] = [random.extreme(1, 3), random.extreme(1, 4), random.extreme(1, 5), random.extreme(1, 5)];
+        let channels: Vec<usize> = (0..parts).map(|_| random.extreme(1, 4)).collect();
+        let (kernel, out) = (random.pick(&[1, 3]), random.pick(&[1, 2, 8, 17]));
+        let mut inputs = vec![Input::random("x0", [b, h, w, c])];
+        let beside = ["x1", "x2"].into_iter().zip(&channels);
+        inputs.extend(beside.map(|(name, &c)| Input::random(name, [b, 2 * h, 2 * w, c])));
+        inputs.push(Input::random("w", [kernel, kernel, c + channels.iter().sum::<usize>(), out]));
+        if random.coin() {
+            inputs.push(Input::random("b", [out]));
+        }
+        Some(Case::drawn(op, inputs))
     }
 }
 
