@@ -84,6 +84,7 @@ fn every_formula_stands_where_the_list_says() {
 #[ignore = "writes a copy of the crate to PARALLAX_PLANT"]
 fn plant() {
     let to = std::env::var("PARALLAX_PLANT").expect("PARALLAX_PLANT names a folder");
+    fs::create_dir_all(&to).expect("a folder");
     for name in ["Cargo.toml", "Cargo.lock", "build.rs", "rustfmt.toml", "src", "tests", "benches", "examples"] {
         copy(Path::new(name), &Path::new(&to).join(name));
     }
@@ -116,7 +117,20 @@ mod noticed {
     use parallax::gradcheck::{CHECKS, Pieces, SIZES, Subject};
     use parallax::ops::registry;
     use parallax::tensor::pool;
-    use parallax::tensor::regime::mutants::{Bug, plant, plant_formula};
+    use parallax::tensor::regime::mutants::{Bug, plant, plant_formula, plant_overwriting};
+
+    /// Cuts of which a bug changes nothing.
+    /// File, and what stands at the cut.
+    const HARMLESS: [(&str, &str); 1] =
+        // The last piece is the row below the image, which has no differences.
+        [("src/ops/depth/smoothness.rs", "parallel::for_each_piece(pieces, 24 * image.len(),")];
+
+    fn is_harmless(file: &str, line: u32) -> bool {
+        let at = |known: &str| {
+            std::fs::read_to_string(known).expect("a source").lines().nth(line as usize - 1).map(str::to_owned)
+        };
+        HARMLESS.iter().any(|(known, code)| file.ends_with(known) && at(known).is_some_and(|line| line.contains(code)))
+    }
 
     /// How many bugs each check noticed first.
     #[derive(Default)]
@@ -164,27 +178,48 @@ mod noticed {
             let cases = entry.cases();
             let subjects: Vec<Subject> = cases.iter().map(|case| Subject::new(case.as_ref(), 1)).collect();
             let pieces: Vec<Pieces> = subjects.iter().map(Pieces::new).collect();
-            // Which cases cut where, at which size.
-            let mut places: BTreeMap<(&str, u32), Vec<(usize, usize)>> = BTreeMap::new();
+            // Which cases cut where, at which size; the most pieces, and whether they are cut by length.
+            let mut places: BTreeMap<(&str, u32), (Vec<(usize, usize)>, usize, bool)> = BTreeMap::new();
             for (k, pieces) in pieces.iter().enumerate() {
                 for size in SIZES {
                     for cut in pieces.check(size).cuts.iter().filter(|cut| cut.pieces > 1) {
                         let file = cut.location.file();
-                        let at = places.entry((file, cut.location.line())).or_default();
+                        let (at, most, by_length) = places.entry((file, cut.location.line())).or_default();
+                        *most = cut.pieces.max(*most);
+                        *by_length |= cut.rest.is_some();
                         if at.last() != Some(&(k, size)) {
                             at.push((k, size));
                         }
                     }
                 }
             }
-            for ((file, line), at) in places {
+            for ((file, line), (at, most, by_length)) in places {
                 for bug in Bug::ALL {
+                    let harmless = is_harmless(file, line)
+                        || (bug == Bug::DropsBeyondSecond && most < 3)
+                        || (bug == Bug::ShortensLast && !by_length);
+                    if harmless {
+                        continue;
+                    }
                     plant(Some((file.to_owned(), line, bug)));
-                    let noticed = at.iter().find_map(|&(k, size)| with_small_pieces(&pieces[k], &[size]));
+                    let look = || at.iter().find_map(|&(k, size)| with_small_pieces(&pieces[k], &[size]));
+                    let noticed = look().or_else(|| {
+                        // Some kernels do what overflowed again with more care, and NaN looks like overflow.
+                        pool::set_poison(false);
+                        let noticed = look();
+                        pool::set_poison(true);
+                        noticed
+                    });
                     score.add(bug.name(), format!("{}: {bug:?} at {file}:{line}", entry.name), noticed);
                 }
             }
             plant(None);
+            plant_overwriting(true);
+            let noticed = subjects.iter().find_map(|subject| first_failure(subject, &[]));
+            plant_overwriting(false);
+            if subjects.iter().any(|subject| subject.all.contains(&true)) {
+                score.add("overwrites", format!("{}: gradients are not added", entry.name), noticed);
+            }
         }
         pool::set_poison(false);
         for (number, formula) in super::formulas().iter().enumerate() {

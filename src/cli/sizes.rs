@@ -3,6 +3,7 @@
 use parallax::Result;
 use parallax::monovit::Preset;
 use parallax::monovit::setup::check_size;
+use parallax::tensor::Precision;
 
 #[derive(clap::Args, Clone)]
 pub struct Sizes {
@@ -32,5 +33,32 @@ impl Sizes {
             return Err(parallax::Error::setting("--batch", "at least 1"));
         }
         Ok(())
+    }
+}
+
+/// Numbers in which products of convolutions and linear layers are taken, in inference.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Numbers {
+    /// f32.
+    F32,
+    /// bf16, summed in f32: where the processor has AVX-512 BF16.
+    Bf16,
+}
+
+impl Numbers {
+    /// The library's word for it.
+    ///
+    /// # Errors
+    /// If this machine has no instruction for it.
+    pub fn checked(self) -> Result<Precision> {
+        let precision = match self {
+            Numbers::F32 => Precision::F32,
+            Numbers::Bf16 => Precision::Bf16,
+        };
+        if !precision.is_available() {
+            let message = "this processor has no AVX-512 BF16 (or PARALLAX_SIMD forbids it): take f32";
+            return Err(parallax::Error::setting("--precision", message));
+        }
+        Ok(precision)
     }
 }

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use super::Folded;
 use super::params::{Identity, ParamId, Params};
 use crate::random::{Random, Stream};
-use crate::tensor::{Float, Gradients, Tape, Tensor, Var, profile};
+use crate::tensor::{Float, Gradients, Precision, Tape, Tensor, Var, profile};
 
 /// Mode of normalisation layers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -29,6 +29,7 @@ pub struct Context<T: Float> {
     vars: Vec<Var<T>>,
     identities: Arc<Vec<Identity>>,
     mode: Mode,
+    precision: Precision,
     /// Running statistics that this pass has moved; later uses in the same pass go on from here.
     moved: RefCell<HashMap<ParamId, Tensor<T>>>,
     /// The dice of DropPath.
@@ -55,7 +56,9 @@ impl<T: Float> Context<T> {
     /// Inference with normalisations folded into convolutions: what [`inference`](Context::inference) computes, but for
     /// rounding, and faster.
     pub fn folded(params: &Folded<T>) -> Self {
-        Self::constant(params.params(), Mode::Folded)
+        let mut context = Self::constant(params.params(), Mode::Folded);
+        context.precision = params.precision();
+        context
     }
 
     fn constant(params: &Params<T>, mode: Mode) -> Self {
@@ -67,7 +70,16 @@ impl<T: Float> Context<T> {
     fn with(params: &Params<T>, vars: Vec<Var<T>>, mode: Mode, random: Random) -> Self {
         let identities = params.identities();
         let (moved, random) = (RefCell::default(), RefCell::new(random));
-        Context { vars, identities, mode, moved, random, seen: None, differentiated: Cell::new(false) }
+        Context {
+            vars,
+            identities,
+            mode,
+            precision: Precision::F32,
+            moved,
+            random,
+            seen: None,
+            differentiated: Cell::new(false),
+        }
     }
 
     /// This pass with intermediate values kept: those that modules [`observe`](Context::observe).
@@ -96,6 +108,11 @@ impl<T: Float> Context<T> {
     pub fn var(&self, id: ParamId) -> &Var<T> {
         id.check(self.identities.get(id.index()));
         &self.vars[id.index()]
+    }
+
+    /// The numbers in which products of convolutions and linear layers are taken.
+    pub fn precision(&self) -> Precision {
+        self.precision
     }
 
     /// Whether this is training.

@@ -65,16 +65,20 @@ impl Conv {
         Conv { weight, bias, op }
     }
 
+    fn op<T: Float>(&self, c: &Context<T>) -> Conv2d {
+        Conv2d { precision: c.precision(), ..self.op }
+    }
+
     /// `[B, H, W, in] -> [B, H', W', out]`.
     #[track_caller]
     pub fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
-        x.conv2d(c.var(self.weight), self.bias.map(|b| c.var(b)), self.op)
+        x.conv2d(c.var(self.weight), self.bias.map(|b| c.var(b)), self.op(c))
     }
 
     /// The convolution of images side by side along their channels, `[B, H, W, ..] -> [B, H', W', out]`.
     #[track_caller]
     pub fn forward_parts<T: Float>(&self, c: &Context<T>, parts: &[&Var<T>]) -> Var<T> {
-        Var::conv2d_of_parts(parts, c.var(self.weight), self.bias.map(|b| c.var(b)), self.op)
+        Var::conv2d_of_parts(parts, c.var(self.weight), self.bias.map(|b| c.var(b)), self.op(c))
     }
 
     /// The same of images `joined`, times one gate `[in]` for each of their channels, if there is one: the weights take
@@ -85,8 +89,8 @@ impl Conv {
         let gated = gate.map(|gate| weight * gate.reshape([1, 1, gate.shape().len(), 1]));
         let weight = gated.as_ref().unwrap_or(weight);
         match joined.small {
-            Some(small) => Var::conv2d_of_upsampled(small, &joined.parts, weight, bias, self.op),
-            None => Var::conv2d_of_parts(&joined.parts, weight, bias, self.op),
+            Some(small) => Var::conv2d_of_upsampled(small, &joined.parts, weight, bias, self.op(c)),
+            None => Var::conv2d_of_parts(&joined.parts, weight, bias, self.op(c)),
         }
     }
 
@@ -125,7 +129,7 @@ impl Normalised<Conv> {
         if !c.is_folded() {
             return self.bn.forward(c, &self.conv.forward_parts(c, parts));
         }
-        let op = self.conv.op.activated(self.bn.activation);
+        let op = self.conv.op(c).activated(self.bn.activation);
         Var::conv2d_of_parts(parts, c.var(self.conv.weight), Some(c.var(self.bn.bias)), op)
     }
 }

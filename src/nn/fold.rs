@@ -5,12 +5,15 @@
 //! passes over memory, and a third for the activation, is then the convolution alone.
 
 use super::{BatchNorm, Params};
-use crate::tensor::Float;
+use crate::tensor::{Float, Precision};
 
 /// Parameters whose normalisations have been folded: for [`Context::folded`](super::Context::folded) alone, since only
 /// modules that know of it may use them.
 #[derive(Clone, Debug)]
-pub struct Folded<T: Float>(Params<T>);
+pub struct Folded<T: Float> {
+    params: Params<T>,
+    precision: Precision,
+}
 
 impl<T: Float> Folded<T> {
     /// Folds every normalisation that stands directly behind a convolution: the weight takes the factor, and the
@@ -30,10 +33,24 @@ impl<T: Float> Folded<T> {
             let shift = folded.value_mut(bn.bias).data_mut().iter_mut().zip(beta.iter().zip(mean).zip(&scale));
             shift.for_each(|(b, ((beta, mean), s))| *b = T::of(beta.f64() - mean.f64() * s));
         }
-        Folded(folded)
+        Folded { params: folded, precision: Precision::F32 }
+    }
+
+    /// The same, with products of convolutions and linear layers in other numbers.
+    ///
+    /// # Panics
+    /// If this machine has not the instruction for it: see [`Precision::is_available`].
+    pub fn with_precision(self, precision: Precision) -> Self {
+        assert!(precision.is_available(), "this machine multiplies no numbers in {precision:?}");
+        Folded { precision, ..self }
+    }
+
+    /// The numbers in which products are taken.
+    pub fn precision(&self) -> Precision {
+        self.precision
     }
 
     pub(super) fn params(&self) -> &Params<T> {
-        &self.0
+        &self.params
     }
 }

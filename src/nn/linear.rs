@@ -1,6 +1,8 @@
 //! The linear layer as a module.
 
 use super::{Builder, Context, Init, Layout, ParamId};
+use crate::ops::apply1;
+use crate::ops::product::linear;
 use crate::tensor::{Float, Var};
 
 /// Linear layer `y = x w (+ b)` with weight `[in, out]` and bias `[out]`.
@@ -18,15 +20,22 @@ impl Linear {
         Linear { weight, bias }
     }
 
+    #[track_caller]
+    fn apply<T: Float>(&self, c: &Context<T>, x: &Var<T>, gelu: bool) -> Var<T> {
+        let op = linear::Linear { gelu, precision: c.precision(), ..linear::Linear::default() };
+        let inputs = [x, c.var(self.weight)].into_iter().chain(self.bias.map(|b| c.var(b)));
+        apply1(op, &inputs.collect::<Vec<_>>())
+    }
+
     /// `[.., in] -> [.., out]`.
     #[track_caller]
     pub fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
-        x.linear(c.var(self.weight), self.bias.map(|b| c.var(b)))
+        self.apply(c, x, false)
     }
 
     /// The layer applied to gelu(x), `[.., in] -> [.., out]`.
     #[track_caller]
     pub fn forward_of_gelu<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
-        x.gelu_linear(c.var(self.weight), self.bias.map(|b| c.var(b)))
+        self.apply(c, x, true)
     }
 }

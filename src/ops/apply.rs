@@ -76,6 +76,8 @@ fn node<T: Float>(name: &'static str, op: &dyn Node<T>, inputs: &[&Var<T>]) -> R
     let values: Vec<&Tensor<T>> = inputs.iter().map(|v| v.value()).collect();
 
     let running = profile::begin_forward(|| op.entry(&shapes, &expected, &needs));
+    #[cfg(mutants)]
+    regime::mutants::runs_in::<T>();
     let label = regime::label(|| (name, op.algo(&shapes)));
     let (mut outputs, backward) = regime::of_op(label, || op.compute(&values, &needs));
     let place = profile::end_forward(running, &outputs);
@@ -87,6 +89,8 @@ fn node<T: Float>(name: &'static str, op: &dyn Node<T>, inputs: &[&Var<T>]) -> R
             let slots = inputs.iter().map(|v| v.slot()).collect();
             let timed = move |upstream: Upstream<T>, sink: &mut GradSink<'_, T>| {
                 let running = profile::begin_backward(place);
+                #[cfg(mutants)]
+                regime::mutants::runs_in::<T>();
                 regime::of_op(label, || backward(upstream, sink));
                 profile::end_backward(running);
             };

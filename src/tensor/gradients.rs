@@ -65,6 +65,8 @@ impl<'a, T: Float> GradSink<'a, T> {
     /// onto what is there with [`Accum::Add`]. Not called if nobody wants it.
     pub fn accumulate(&mut self, i: usize, kernel: impl FnOnce(&mut [T], Accum)) {
         if let Some((out, accum)) = self.place(i) {
+            #[cfg(mutants)]
+            let accum = if super::regime::mutants::overwrites() { Accum::Replace } else { accum };
             kernel(out, accum);
         }
     }

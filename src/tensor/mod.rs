@@ -12,10 +12,12 @@
 //! | [`gradients`] | where gradients are accumulated and read |
 //! | [`gemm`] | matrix products (faer) |
 //! | `register_tile` | products whose operands stay where they lie: convolutions, linear layers |
+//! | `bf16` | the same of numbers rounded to 8 bits, for inference |
 //! | [`parallel`] | threads, with the same bits for any number of them |
 //! | [`simd`] | run-time choice of instruction set |
 //! | [`profile`] | what ran, and how long |
 
+mod bf16;
 mod compiled;
 mod data;
 pub mod float;
@@ -32,6 +34,7 @@ pub mod simd;
 pub mod tape;
 pub mod var;
 
+pub use bf16::Precision;
 pub use compiled::Signature;
 pub use data::Tensor;
 pub use float::Float;

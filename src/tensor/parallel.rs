@@ -95,10 +95,12 @@ fn cut<T: Send>(
 ) {
     #[cfg(mutants)]
     if let Some(bug) = regime::mutants::at(place) {
-        let (count, single) = (data.len().div_ceil(chunk), size_of::<T>() == 4);
+        let count = data.len().div_ceil(chunk);
         for (i, piece) in data.chunks_mut(chunk).enumerate() {
-            if let Some(other) = bug.instead(i, count, single) {
-                f(other, piece);
+            let short = bug == regime::mutants::Bug::ShortensLast && i > 0 && i + 1 == count && size_of::<T>() > 0;
+            let length = piece.len() - usize::from(short);
+            if let Some(other) = bug.instead(i, count) {
+                f(other, &mut piece[..length]);
             }
         }
         return;

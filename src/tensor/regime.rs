@@ -93,9 +93,10 @@ pub(crate) fn note(location: &'static Location<'static>, pieces: usize, rest: Op
 /// A bug planted at one cut, to see whether the checks notice: only in builds with `--cfg mutants`.
 #[cfg(mutants)]
 pub mod mutants {
+    use std::cell::Cell;
     use std::panic::Location;
     use std::sync::Mutex;
-    use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+    use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering::Relaxed};
 
     /// What goes wrong at the cut.
     #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -110,12 +111,20 @@ pub mod mutants {
         ReadsFirst,
         /// The last of several pieces is not computed, in f32 alone.
         DropsLastInSingle,
+        /// The last of several pieces lacks its last element, where pieces are cut by length.
+        ShortensLast,
     }
 
     impl Bug {
         /// All of them.
-        pub const ALL: [Bug; 5] =
-            [Bug::DropsLast, Bug::DropsBeyondSecond, Bug::ReadsPrevious, Bug::ReadsFirst, Bug::DropsLastInSingle];
+        pub const ALL: [Bug; 6] = [
+            Bug::DropsLast,
+            Bug::DropsBeyondSecond,
+            Bug::ReadsPrevious,
+            Bug::ReadsFirst,
+            Bug::DropsLastInSingle,
+            Bug::ShortensLast,
+        ];
 
         /// What it is called in tables.
         pub fn name(self) -> &'static str {
@@ -125,20 +134,44 @@ pub mod mutants {
                 Bug::ReadsPrevious => "reads the previous",
                 Bug::ReadsFirst => "reads the first",
                 Bug::DropsLastInSingle => "drops the last in f32",
+                Bug::ShortensLast => "shortens the last",
             }
         }
 
         /// The piece that is computed in the place of piece `i` of `count`, if one is.
-        pub(crate) fn instead(self, i: usize, count: usize, single: bool) -> Option<usize> {
+        pub(crate) fn instead(self, i: usize, count: usize) -> Option<usize> {
             match self {
                 Bug::DropsLast if i > 0 && i + 1 == count => None,
-                Bug::DropsLastInSingle if single && i > 0 && i + 1 == count => None,
+                Bug::DropsLastInSingle if SINGLE.get() && i > 0 && i + 1 == count => None,
                 Bug::DropsBeyondSecond if i > 1 => None,
                 Bug::ReadsPrevious => Some(i.saturating_sub(1)),
                 Bug::ReadsFirst => Some(0),
                 _ => Some(i),
             }
         }
+    }
+
+    thread_local! {
+        /// Whether the op that runs on this thread runs in f32.
+        static SINGLE: Cell<bool> = const { Cell::new(false) };
+    }
+
+    /// Notes in which element type an op is about to run.
+    pub(crate) fn runs_in<T>() {
+        SINGLE.set(size_of::<T>() == 4);
+    }
+
+    /// Whether a gradient that is to be added is written over what is there.
+    static OVERWRITES: AtomicBool = AtomicBool::new(false);
+
+    /// Plants it, or takes it away.
+    pub fn plant_overwriting(on: bool) {
+        OVERWRITES.store(on, Relaxed);
+    }
+
+    /// Whether it is planted.
+    pub(crate) fn overwrites() -> bool {
+        OVERWRITES.load(Relaxed)
     }
 
     static PLANTED: Mutex<Option<(String, u32, Bug)>> = Mutex::new(None);
@@ -179,8 +212,7 @@ pub fn blocks(range: Range<usize>, usual: usize) -> impl Iterator<Item = Range<u
     let runs = {
         let (bug, all) = (mutants::at(Location::caller()), runs.collect::<Vec<_>>());
         let kept = all.clone().into_iter().enumerate();
-        kept.filter(move |(i, _)| bug.is_none_or(|bug| bug.instead(*i, all.len(), false) == Some(*i)))
-            .map(|(_, run)| run)
+        kept.filter(move |(i, _)| bug.is_none_or(|bug| bug.instead(*i, all.len()) == Some(*i))).map(|(_, run)| run)
     };
     runs
 }

@@ -12,7 +12,7 @@ use pulp::{Simd, WithSimd};
 use super::gemm::Accum;
 use super::pool::Buffer;
 use super::simd::copy_run;
-use super::{Float, parallel, simd};
+use super::{Float, Precision, Signature, bf16, parallel, simd};
 
 /// Vectors side by side in a tile of the result.
 const VECTORS: usize = 2;
@@ -37,12 +37,18 @@ enum Data<'a, T: Float> {
     Packed(Buffer<T>),
     /// Row by row, in whole vectors.
     Dense(&'a [T]),
+    /// Panels as well, of pairs of rows in bf16.
+    Pairs(Buffer<f32>),
 }
 
 impl<'a, T: Float> Panels<'a, T> {
-    /// A dense matrix, which `uses` rows are to be multiplied with.
-    pub(crate) fn dense(matrix: &'a [T], rows: usize, cols: usize, uses: usize) -> Self {
+    /// A dense matrix, which `uses` rows are to be multiplied with. In bf16 every line of those has an even number of
+    /// columns ([`Precision::of_lines`]); f64 stays what it is.
+    pub(crate) fn dense(matrix: &'a [T], rows: usize, cols: usize, uses: usize, precision: Precision) -> Self {
         let lanes = simd::lanes::<T>();
+        if precision == Precision::Bf16 && size_of::<T>() == size_of::<f32>() {
+            return Self::pairs(matrix, rows, cols);
+        }
         if uses < MANY && cols.is_multiple_of(lanes) {
             return Panels { data: Data::Dense(&matrix[..rows * cols]), rows, cols, lanes };
         }
@@ -51,6 +57,22 @@ impl<'a, T: Float> Panels<'a, T> {
                 copy_run(&mut out[..width], &row[first..first + width]);
             }
         })
+    }
+
+    fn pairs(matrix: &[T], rows: usize, cols: usize) -> Self {
+        let lanes = simd::lanes::<T>();
+        let mut data = Buffer::<f32>::stale(rows / 2 * cols.next_multiple_of(lanes));
+        let work = data.len();
+        if rows > 0 {
+            parallel::for_each_chunk(&mut data, VECTORS * lanes * rows / 2, work, |k, panel| {
+                let step = 2 * panel.len() / rows;
+                T::dispatch(
+                    #[inline(always)]
+                    || bf16::pack(panel, matrix, cols, k * VECTORS * lanes, step),
+                );
+            });
+        }
+        Panels { data: Data::Pairs(data), rows, cols, lanes }
     }
 
     /// The transpose of a dense `[cols, rows]` matrix.
@@ -112,12 +134,19 @@ pub(crate) struct Product<'a, T: Float> {
     pub(crate) panels: &'a Panels<'a, T>,
 }
 
+/// The kernel for a right operand in bf16.
+struct OfPairs;
+
+impl Signature for OfPairs {
+    type Of<T: Float> = fn(&mut Product<'_, T>, &[f32]);
+}
+
 impl<T: Float> Product<'_, T> {
     /// Computes it.
     ///
     /// # Panics
     /// If a line is too short, or B has not as many rows as A has columns.
-    pub(crate) fn run(self) {
+    pub(crate) fn run(mut self) {
         let Panels { rows, cols, .. } = *self.panels;
         let columns: usize = self.lines.iter().map(|line| line.run).sum();
         assert_eq!(rows, columns, "rows of the right operand");
@@ -130,7 +159,12 @@ impl<T: Float> Product<'_, T> {
             }
             return;
         }
-        T::dispatch(self);
+        match &self.panels.data {
+            Data::Pairs(panels) => {
+                T::pick::<OfPairs>(bf16::product, |_, _| unreachable!("only f32 is packed in bf16"))(&mut self, panels)
+            }
+            _ => T::dispatch(self),
+        }
     }
 
     #[inline(always)]
@@ -161,6 +195,7 @@ impl<T: Float> Product<'_, T> {
         let panel = match &self.panels.data {
             Data::Packed(data) => &data[first * self.panels.rows..][..self.panels.rows * N * T::lanes::<S>()],
             Data::Dense(matrix) => &matrix[first..],
+            Data::Pairs(_) => unreachable!("taken by another kernel"),
         };
         let mut at = 0;
         while at + P <= rows {
@@ -295,7 +330,7 @@ impl<T: Float> WithSimd for Product<'_, T> {
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
         match self.panels.data {
-            Data::Packed(_) => self.panels::<S, false>(simd),
+            Data::Packed(_) | Data::Pairs(_) => self.panels::<S, false>(simd),
             Data::Dense(_) => self.panels::<S, true>(simd),
         }
     }
@@ -433,7 +468,7 @@ mod tests {
             };
             for (accum, start) in [(Accum::Replace, 0.0), (Accum::Add, 0.5)] {
                 let product = |uses: usize| {
-                    let panels = Panels::dense(&b, lines.len() * run, cols, uses);
+                    let panels = Panels::dense(&b, lines.len() * run, cols, uses, Precision::F32);
                     let mut out = vec![if accum == Accum::Add { start } else { f64::NAN }; rows * cols];
                     Product { out: &mut out, out_step: cols, accum, lines: &lines, panels: &panels }.run();
                     out
@@ -456,7 +491,7 @@ mod tests {
         let lines: Vec<Line<f64>> =
             (0..runs.len()).map(|l| Line { data: &data[l], step: steps[l], run: runs[l] }).collect();
         let b = numbers(274 * cols);
-        let panels = Panels::dense(&b, 274, cols, rows);
+        let panels = Panels::dense(&b, 274, cols, rows, Precision::F32);
         let mut out = vec![f64::NAN; rows * cols];
         Product { out: &mut out, out_step: cols, accum: Accum::Replace, lines: &lines, panels: &panels }.run();
         for (i, &found) in out.iter().enumerate() {
@@ -471,7 +506,7 @@ mod tests {
     fn rows_of_a_product_may_stand_apart() {
         let (rows, cols, run, step) = (14, 5, 3, 12);
         let (a, b) = (numbers(rows * run), numbers(run * cols));
-        let panels = Panels::dense(&b, run, cols, rows);
+        let panels = Panels::dense(&b, run, cols, rows, Precision::F32);
         let lines = [Line { data: &a, step: run, run }];
         // With and without what is missing behind the last row's numbers.
         for len in [rows * step, (rows - 1) * step + cols] {
@@ -490,7 +525,8 @@ mod tests {
     fn panels_of_a_transpose_are_those_of_the_matrix() {
         let b = numbers(7 * 21);
         let turned: Vec<f64> = (0..7 * 21).map(|i| b[(i % 7) * 21 + i / 7]).collect();
-        let [packed, of_transpose] = [Panels::dense(&b, 7, 21, MANY), Panels::transposed(&turned, 7, 21)];
+        let [packed, of_transpose] =
+            [Panels::dense(&b, 7, 21, MANY, Precision::F32), Panels::transposed(&turned, 7, 21)];
         let (Data::Packed(packed), Data::Packed(of_transpose)) = (packed.data, of_transpose.data) else {
             panic!("packed, for as many uses");
         };

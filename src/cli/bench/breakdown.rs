@@ -82,6 +82,7 @@ fn divide(row: &mut Row, n: usize) {
 
 #[cfg(test)]
 mod tests {
+    use parallax::tensor::Precision;
     use std::time::Duration;
 
     use parallax::monovit::Preset;
@@ -95,7 +96,7 @@ mod tests {
 
     #[test]
     fn the_rows_of_a_training_step_add_up_to_the_traced_total() {
-        let mut network = Network::new(&PICO, 0, true).expect("sizes that fit");
+        let mut network = Network::new(&PICO, 0, None).expect("sizes that fit");
         let profiles = [(); 2].map(|()| {
             let (done, profile) = profile::profile(|| network.once());
             done.expect("a step");
@@ -124,7 +125,7 @@ mod tests {
 
     #[test]
     fn an_inference_has_no_backward_pass() {
-        let mut network = Network::new(&PICO, 0, false).expect("sizes that fit");
+        let mut network = Network::new(&PICO, 0, Some(Precision::F32)).expect("sizes that fit");
         let profiles = measure(&mut network, 1, true).expect("an inference").profiles;
         let rows = rows(&profiles);
         assert!(rows.len() > 10);

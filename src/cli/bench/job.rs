@@ -9,7 +9,7 @@ use parallax::ops::Conv2d;
 use parallax::random::Random;
 use parallax::tensor::profile;
 use parallax::tensor::profile::Profile;
-use parallax::tensor::{Shape, Tensor, Var, pool};
+use parallax::tensor::{Precision, Shape, Tensor, Var, pool};
 use parallax::train::RunConfig;
 use parallax::train::Trainer;
 
@@ -71,8 +71,8 @@ pub struct Network {
 }
 
 impl Network {
-    /// The network of the given sizes, with a batch.
-    pub fn new(sizes: &Sizes, seed: u64, step: bool) -> Result<Self> {
+    /// The network of the given sizes, with a batch: for training, or for prediction in some numbers.
+    pub fn new(sizes: &Sizes, seed: u64, infer: Option<Precision>) -> Result<Self> {
         sizes.check()?;
         let mut config = RunConfig::new(sizes.preset, 1_000_000);
         // The step as it is for most of the run.
@@ -80,7 +80,7 @@ impl Network {
         config.rotations.keep = 0.0;
         config.seed = seed;
         let trainer = Trainer::new(config.model(), config.plan());
-        let folded = (!step).then(|| Folded::new(&trainer.params));
+        let folded = infer.map(|precision| Folded::new(&trainer.params).with_precision(precision));
         Ok(Network { trainer, batch: batch(sizes, seed), folded })
     }
 }

@@ -8,9 +8,10 @@ mod roofline;
 use std::path::PathBuf;
 
 use parallax::Result;
+use parallax::tensor::Precision;
 use serde::Serialize;
 
-use super::sizes::Sizes;
+use super::sizes::{Numbers, Sizes};
 use breakdown::Row;
 use job::{Conv, Measured, Network};
 
@@ -25,7 +26,13 @@ enum What {
     /// Time a whole training step: four networks, four scales, the loss, backward, AdamW.
     Step(Timed),
     /// Time the prediction of disparities.
-    Infer(Timed),
+    Infer {
+        #[command(flatten)]
+        timed: Timed,
+        /// Numbers in which products are taken.
+        #[arg(long, value_enum, default_value = "f32")]
+        precision: Numbers,
+    },
     /// Compare each op of a training step with the machine's limits of arithmetic and memory.
     #[command(alias = "ops")]
     Roofline(Counted),
@@ -94,8 +101,8 @@ struct Timing {
 
 pub fn run(args: Args) -> Result<()> {
     match args.what {
-        What::Step(timed) => time_network(&timed, true),
-        What::Infer(timed) => time_network(&timed, false),
+        What::Step(timed) => time_network(&timed, None),
+        What::Infer { timed, precision } => time_network(&timed, Some(precision.checked()?)),
         What::Roofline(counted) => roofline::run(&counted),
         What::Conv { iterations, json } => {
             report(&timing(job::measure(&mut Conv::new(), iterations, false)?, false)?, json)
@@ -104,10 +111,11 @@ pub fn run(args: Args) -> Result<()> {
     }
 }
 
-fn time_network(Timed { counted, no_breakdown }: &Timed, step: bool) -> Result<()> {
-    let mut network = Network::new(&counted.sizes, counted.seed, step)?;
+/// Times a training step, or the prediction of disparities in some numbers.
+fn time_network(Timed { counted, no_breakdown }: &Timed, infer: Option<Precision>) -> Result<()> {
+    let mut network = Network::new(&counted.sizes, counted.seed, infer)?;
     let measured = job::measure(&mut network, counted.iterations, !no_breakdown)?;
-    report(&timing(measured, step)?, counted.sizes.json)
+    report(&timing(measured, infer.is_none())?, counted.sizes.json)
 }
 
 fn timing(measured: Measured, step: bool) -> Result<Timing> {

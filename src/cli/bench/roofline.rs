@@ -61,7 +61,7 @@ struct Roofline {
 }
 
 pub fn run(Counted { sizes, iterations, seed }: &Counted) -> Result<()> {
-    let mut network = Network::new(sizes, *seed, true)?;
+    let mut network = Network::new(sizes, *seed, None)?;
     let ceilings = Ceilings { gemm_gflops: gemm_ceiling(), memory_gbs: memory_ceiling() };
     let measured = job::measure(&mut network, *iterations, true)?;
     let rows = breakdown::rows(&measured.profiles);

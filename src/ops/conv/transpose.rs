@@ -10,7 +10,7 @@ use crate::ops::support::row_products::rows_of;
 use crate::ops::support::sums::bias_gradient;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::random::Random;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
+use crate::tensor::{Accum, Float, GradSink, Precision, Shape, Tensor, Upstream, Var};
 
 /// `x [batch, height, width, in]`, `w [kh, kw, out / groups, in]`, optionally `b [out]`
 /// -> `[batch, (height - 1) stride - 2 padding + dilation (kh - 1) + output padding + 1, ..., out]`: pixel i times tap
@@ -147,7 +147,7 @@ impl<T: Float> Op<T> for ConvTranspose2d {
         let dy = upstream.only();
         if let Some(w) = w {
             sink.accumulate(0, |out, accum| {
-                kernel::convolve(out, accum, &g, &whole(&g, dy.data()), w.data(), &Finish::nothing())
+                kernel::convolve(out, accum, &g, &whole(&g, dy.data()), w.data(), &Finish::nothing(), Precision::F32)
             });
         }
         if let Some(x) = x {

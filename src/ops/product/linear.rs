@@ -11,7 +11,7 @@ use crate::random::Random;
 use crate::tensor::gemm::Rows;
 use crate::tensor::pool::Buffer;
 use crate::tensor::register_tile::Panels;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var, parallel, regime};
+use crate::tensor::{Accum, Float, GradSink, Precision, Shape, Tensor, Upstream, Var, parallel, regime};
 
 /// Linear layer: `y [.., out] = x [.., in] w [in, out] (+ b [out])`. A 1x1 convolution is the same thing.
 #[derive(Clone, Copy, Debug, Default)]
@@ -21,6 +21,8 @@ pub struct Linear {
     pub gelu: bool,
     /// Rows handed to a thread at a time.
     pub tile: Tile,
+    /// Numbers in which products are taken, in f32's forward pass.
+    pub precision: Precision,
 }
 
 /// `to = gelu(from)`.
@@ -41,12 +43,12 @@ fn apply_gelu<T: Float>(x: &Tensor<T>) -> Tensor<T> {
 }
 
 /// `out = gelu(x) w`, finished; x has rows of k.
-fn forward_of_gelu<T: Float>(out: &mut [T], x: Rows<T>, w: &[T], finish: &Finish<T>, tile: Tile) {
+fn forward_of_gelu<T: Float>(out: &mut [T], x: Rows<T>, w: &[T], finish: &Finish<T>, tile: Tile, precision: Precision) {
     let k = x.cols;
     let n = out.len() / x.rows.max(1);
     let tile = tile_rows(tile, k, n);
     let work = (2 * n + 16) * x.rows * k;
-    let panels = Panels::dense(w, k, n, x.rows);
+    let panels = Panels::dense(w, k, n, x.rows, precision.of_lines([k].into_iter()));
     parallel::for_each_chunk(out, tile * n, work, |i, out| {
         let rows = out.len() / n;
         let mut h = Buffer::stale(rows * k);
@@ -109,8 +111,8 @@ impl<T: Float> Op<T> for Linear {
         let rows = Rows::dense(x.data(), x.shape().rows(), w.dims()[0]);
         let finish = Finish::new(b.map(|b| b.data()), Activation::None);
         let y = Tensor::build(shape, |out| match self.gelu {
-            true => forward_of_gelu(out, rows, w.data(), &finish, self.tile),
-            false => forward(out, &[rows], w.data(), &finish, self.tile),
+            true => forward_of_gelu(out, rows, w.data(), &finish, self.tile, self.precision),
+            false => forward(out, &[rows], w.data(), &finish, self.tile, self.precision),
         });
         let x_matters = needs.get(1) || self.gelu && needs.get(0);
         (vec![y], (x_matters.then(|| x.clone()), needs.get(0).then(|| w.clone())))
@@ -143,8 +145,8 @@ impl Checked for Linear {
         let x = |shape: &[usize]| Input::random("x", shape);
         let w = |k: usize, n: usize| Input::random("w", [k, n]);
         let b = |n: usize| Input::random("b", [n]);
-        let tiled = |tile| Linear { tile: Tile::of(tile), gelu: false };
-        let gelu = |tile| Linear { tile: Tile::of(tile), gelu: true };
+        let tiled = |tile| Linear { tile: Tile::of(tile), ..Linear::default() };
+        let gelu = |tile| Linear { tile: Tile::of(tile), gelu: true, ..Linear::default() };
         vec![
             Case::new("with bias", tiled(0), [x(&[2, 3, 5]), w(5, 4), b(4)]),
             Case::new("without bias", tiled(0), [x(&[2, 3, 5]), w(5, 4)]),
@@ -168,7 +170,7 @@ impl Checked for Linear {
     }
 
     fn draw(random: &mut Random) -> Option<Case<Self>> {
-        let op = Linear { gelu: random.coin(), tile: Tile::of(random.extreme(0, 5)) };
+        let op = Linear { gelu: random.coin(), tile: Tile::of(random.extreme(0, 5)), ..Linear::default() };
         let [k, n] = [random.pick(&[1, 2, 5, 16, 17]), random.pick(&[1, 2, 8, 17, 33])];
         let mut inputs =
             vec![Input::random("x", [random.extreme(1, 3), random.extreme(1, 9), k]), Input::random("w", [k, n])];
@@ -192,7 +194,7 @@ impl<T: Float> Var<T> {
     /// `gelu(x) [.., in] w [in, out] (+ b [out])`, without ever holding the whole of gelu(x).
     #[track_caller]
     pub fn gelu_linear(&self, weight: &Self, bias: Option<&Self>) -> Self {
-        let op = Linear { gelu: true, tile: Tile::AUTO };
+        let op = Linear { gelu: true, ..Linear::default() };
         match bias {
             Some(bias) => apply1(op, &[self, weight, bias]),
             None => apply1(op, &[self, weight]),

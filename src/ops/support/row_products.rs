@@ -7,7 +7,7 @@ use super::sums::sum_into;
 use crate::ops::Tile;
 use crate::tensor::gemm::Rows;
 use crate::tensor::register_tile::{Gram, Line, Panels, Product};
-use crate::tensor::{Accum, Float, Tensor, parallel, regime};
+use crate::tensor::{Accum, Float, Precision, Tensor, parallel, regime};
 
 /// Pixels as rows of channels.
 pub(in crate::ops) fn rows_of<T: Float>(x: &Tensor<T>) -> Rows<'_, T> {
@@ -20,12 +20,19 @@ pub(in crate::ops) fn tile_rows(tile: Tile, k: usize, n: usize) -> usize {
 }
 
 /// `out = x w`, finished; x may come in parts, whose columns stand side by side.
-pub(in crate::ops) fn forward<T: Float>(out: &mut [T], parts: &[Rows<T>], w: &[T], finish: &Finish<T>, tile: Tile) {
+pub(in crate::ops) fn forward<T: Float>(
+    out: &mut [T],
+    parts: &[Rows<T>],
+    w: &[T],
+    finish: &Finish<T>,
+    tile: Tile,
+    precision: Precision,
+) {
     let k = parts.iter().map(|x| x.cols).sum();
     let n = out.len() / parts[0].rows.max(1);
     let tile = tile_rows(tile, k, n);
     let work = 2 * out.len() * k;
-    let panels = Panels::dense(w, k, n, parts[0].rows);
+    let panels = Panels::dense(w, k, n, parts[0].rows, precision.of_lines(parts.iter().map(|x| x.cols)));
     parallel::for_each_chunk(out, tile * n, work, |i, out| {
         let rows = out.len() / n;
         let lines: Vec<Line<T>> = parts.iter().map(|x| line(x.rows(i * tile, rows))).collect();

@@ -12,7 +12,7 @@ use super::parts::{Part, copy_pixels};
 use crate::ops::support::epilogue::Finish;
 use crate::tensor::pool::Buffer;
 use crate::tensor::register_tile::{Gram, Line, Panels, Product};
-use crate::tensor::{Accum, Float, parallel};
+use crate::tensor::{Accum, Float, Precision, parallel};
 
 /// The rows of one image that some rows of the output see, with their padding.
 pub(in crate::ops) struct Band<T: Float> {
@@ -84,10 +84,12 @@ pub(super) fn convolve<T: Float>(
     x: &[Part<T>],
     w: &[T],
     finish: &Finish<T>,
+    precision: Precision,
 ) {
     let (n, width, tile) = (g.out_channels, g.out[1], g.tile());
-    let panels = Panels::dense(w, g.patch(), n, g.rows() * width);
     let (step, run) = (g.stride[1] * g.channels, g.kernel[1] * g.channels);
+    let precision = precision.of_lines([run].into_iter());
+    let panels = Panels::dense(w, g.patch(), n, g.rows() * width, precision);
     let work = 2 * g.rows() * width * g.patch() * n;
     parallel::for_each_chunk(out, tile * width * n, work, |i, out| {
         let first = i * tile;

@@ -9,7 +9,7 @@ use crate::ops::support::sums::sum_into;
 use crate::tensor::gemm::{Rows, RowsMut, gemm};
 use crate::tensor::pool::Buffer;
 use crate::tensor::simd::copy_run;
-use crate::tensor::{Accum, Float, Tensor, parallel, regime};
+use crate::tensor::{Accum, Float, Precision, Tensor, parallel, regime};
 
 /// Fills the im2col rows of the output pixels of row `oy`, for one group: `[out width, patch]`.
 fn im2col<T: Float>(g: &Geometry, image: &[T], oy: usize, group: usize, patches: &mut [T]) {
@@ -62,12 +62,13 @@ pub(in crate::ops) fn convolve<T: Float>(
     x: &[Part<T>],
     w: &[T],
     finish: &Finish<T>,
+    precision: Precision,
 ) {
     match g.path() {
         Path::Im2col => product(out, accum, g, in_one_piece(g, x, &mut None), w, finish),
         // As part of another convolution; by itself it is a product of matrices.
-        Path::Pointwise | Path::Direct => direct::convolve(out, accum, g, x, w, finish),
-        Path::SideBySide(s) => direct::convolve(out, accum, &g.widened(s), x, &widened(g, s, w), finish),
+        Path::Pointwise | Path::Direct => direct::convolve(out, accum, g, x, w, finish, precision),
+        Path::SideBySide(s) => direct::convolve(out, accum, &g.widened(s), x, &widened(g, s, w), finish, precision),
     }
 }
 
@@ -143,7 +144,7 @@ pub(in crate::ops) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, g: &
     match g.transposed() {
         Some(t) => {
             let turned = turned(g, w);
-            convolve(out, accum, &t, &whole(&t, dy), &turned, &Finish::nothing());
+            convolve(out, accum, &t, &whole(&t, dy), &turned, &Finish::nothing(), Precision::F32);
             if g.beyond != Beyond::Zero {
                 border_gradient(out, g, &t, dy, &turned);
             }

@@ -17,7 +17,7 @@ use crate::ops::support::sums::bias_gradient;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::random::Random;
 use crate::tensor::gemm::Rows;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
+use crate::tensor::{Accum, Float, GradSink, Precision, Shape, Tensor, Upstream, Var};
 use geometry::{Geometry, Path};
 use parts::Part;
 
@@ -47,6 +47,8 @@ pub struct Conv2d {
     pub tile: Tile,
     /// Activation, applied to each tile of the result while it is in the cache.
     pub activation: Activation,
+    /// Numbers in which products are taken, in f32's forward pass.
+    pub precision: Precision,
 }
 
 impl Default for Conv2d {
@@ -60,6 +62,7 @@ impl Default for Conv2d {
             reflect: false,
             tile: Tile::AUTO,
             activation: Activation::None,
+            precision: Precision::F32,
         }
     }
 }
@@ -157,9 +160,17 @@ impl<T: Float> Op<T> for Conv2d {
             Tensor::build([g.batch, g.out[0], g.out[1], g.out_channels], |out| match g.path() {
                 Path::Pointwise => {
                     let rows: Vec<Rows<T>> = xs.iter().map(|x| rows_of(x)).collect();
-                    row_products::forward(out, &rows, w.data(), finish, Tile::AUTO);
+                    row_products::forward(out, &rows, w.data(), finish, Tile::AUTO, self.precision);
                 }
-                _ => kernel::convolve(out, Accum::Replace, &g, &parts_of(xs.iter().copied()), w.data(), finish),
+                _ => kernel::convolve(
+                    out,
+                    Accum::Replace,
+                    &g,
+                    &parts_of(xs.iter().copied()),
+                    w.data(),
+                    finish,
+                    self.precision,
+                ),
             })
         });
         let inputs = needs.get(self.parts).then(|| xs.iter().copied().cloned().collect());
@@ -385,6 +396,7 @@ impl Checked for Conv2d {
             activation: random.pick(&Activation::ALL),
             tile: Tile::of(random.extreme(0, 5)),
             parts: if groups == 1 { random.extreme(1, 3) } else { 1 },
+            precision: Precision::F32,
         };
         let image = [random.extreme(1, 3), random.extreme(1, 7), random.extreme(1, 9)];
         let channels: Vec<usize> = (0..op.parts).map(|_| groups * random.extreme(1, 5)).collect();

@@ -18,7 +18,7 @@ use crate::ops::support::sums::bias_gradient;
 use crate::ops::{Case, Checked, Input, Needs, Op, ShapeError, apply1};
 use crate::random::Random;
 use crate::tensor::gemm::Rows;
-use crate::tensor::{Accum, Float, GradSink, Shape, Tensor, Upstream, Var};
+use crate::tensor::{Accum, Float, GradSink, Precision, Shape, Tensor, Upstream, Var};
 
 /// `x0 [batch, height, width, ..], x1 .. xn [batch, 2 height, 2 width, ..], w [k, k, in, out]`, optionally `b [out]`
 /// -> `[batch, 2 height, 2 width, out]`: the convolution of x0, enlarged, and x1 .. xn, concatenated along the
@@ -31,6 +31,8 @@ pub struct UpsampledConv2d {
     pub parts: usize,
     /// Rows of x0 handed to a thread at a time, chosen by the shapes by default.
     pub tile: Tile,
+    /// Numbers in which products are taken, in f32's forward pass.
+    pub precision: Precision,
     /// Activation, applied to the result.
     pub activation: Activation,
 }
@@ -151,18 +153,22 @@ impl<T: Float> Op<T> for UpsampledConv2d {
                     match g.path() {
                         Path::Pointwise => {
                             let rows: Vec<Rows<T>> = xs[1..].iter().map(|x| rows_of(x)).collect();
-                            row_products::forward(out, &rows, &of_full, &Finish::nothing(), Tile::AUTO);
+                            row_products::forward(out, &rows, &of_full, &Finish::nothing(), Tile::AUTO, self.precision);
                         }
                         Path::Squares => {
                             let parts = parts_of(xs[1..].iter().copied());
-                            kernel::convolve(out, accum, &g.full, &parts, &of_full, &Finish::nothing());
+                            kernel::convolve(out, accum, &g.full, &parts, &of_full, &Finish::nothing(), self.precision);
                         }
                     }
                     accum = Accum::Add;
                 }
                 match g.path() {
-                    Path::Pointwise => pointwise::convolve(out, accum, &g.small, rows_of(xs[0]), &of_small, finish),
-                    Path::Squares => squares::convolve(out, accum, &g.small, xs[0].data(), &of_small, finish),
+                    Path::Pointwise => {
+                        pointwise::convolve(out, accum, &g.small, rows_of(xs[0]), &of_small, finish, self.precision)
+                    }
+                    Path::Squares => {
+                        squares::convolve(out, accum, &g.small, xs[0].data(), &of_small, finish, self.precision)
+                    }
                 }
             })
         });
@@ -312,8 +318,12 @@ impl Checked for UpsampledConv2d {
 
     fn draw(random: &mut Random) -> Option<Case<Self>> {
         let parts = random.extreme(0, 2);
-        let op =
-            UpsampledConv2d { parts, tile: Tile::of(random.extreme(0, 5)), activation: random.pick(&Activation::ALL) };
+        let op = UpsampledConv2d {
+            parts,
+            tile: Tile::of(random.extreme(0, 5)),
+            activation: random.pick(&Activation::ALL),
+            precision: Precision::F32,
+        };
         let [b, h, w, c] = [random.extreme(1, 3), random.extreme(1, 4), random.extreme(1, 5), random.extreme(1, 5)];
         let channels: Vec<usize> = (0..parts).map(|_| random.extreme(1, 4)).collect();
         let (kernel, out) = (random.pick(&[1, 3]), random.pick(&[1, 2, 8, 17]));
@@ -339,8 +349,13 @@ impl<T: Float> Var<T> {
     pub fn conv2d_of_upsampled(small: &Self, parts: &[&Self], weight: &Self, bias: Option<&Self>, op: Conv2d) -> Self {
         let kernel = weight.shape().dims()[0];
         let plain = if kernel == 1 { Conv2d::default() } else { Conv2d::padded(1).reflecting() };
-        assert_eq!(op, plain.activated(op.activation), "a convolution of an enlarged image keeps its size");
-        let op = UpsampledConv2d { parts: parts.len(), tile: Tile::AUTO, activation: op.activation };
+        assert_eq!(
+            Conv2d { precision: Precision::F32, ..op },
+            plain.activated(op.activation),
+            "a convolution of an enlarged image keeps its size"
+        );
+        let Conv2d { activation, precision, .. } = op;
+        let op = UpsampledConv2d { parts: parts.len(), activation, precision, ..UpsampledConv2d::default() };
         let inputs: Vec<&Self> = [small].into_iter().chain(parts.iter().copied()).chain([weight]).chain(bias).collect();
         apply1(op, &inputs)
     }

@@ -6,13 +6,22 @@ use crate::ops::support::epilogue::Finish;
 use crate::ops::support::put::put_run;
 use crate::ops::support::{row_products, squares};
 use crate::tensor::gemm::Rows;
-use crate::tensor::{Accum, Float, Tensor, parallel};
+use crate::tensor::{Accum, Float, Precision, Tensor, parallel};
 
 /// `out = x w` in squares, or added to what is there; and finished.
-pub(super) fn convolve<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: Rows<T>, w: &[T], finish: &Finish<T>) {
+pub(super) fn convolve<T: Float>(
+    out: &mut [T],
+    accum: Accum,
+    g: &Geometry,
+    x: Rows<T>,
+    w: &[T],
+    finish: &Finish<T>,
+    precision: Precision,
+) {
     let n = g.out_channels;
-    let products =
-        Tensor::build([x.rows, n], |out| row_products::forward(out, &[x], w, &Finish::nothing(), Tile::AUTO));
+    let products = Tensor::build([x.rows, n], |out| {
+        row_products::forward(out, &[x], w, &Finish::nothing(), Tile::AUTO, precision)
+    });
     let line = g.out[1] * n;
     let work = 2 * out.len();
     if work == 0 {

@@ -13,7 +13,7 @@ use crate::ops::support::epilogue::Finish;
 use crate::ops::support::sums::sum_into;
 use crate::tensor::pool::Buffer;
 use crate::tensor::register_tile::{Gram, Line, Panels, Product};
-use crate::tensor::{Accum, Float, Tensor, parallel};
+use crate::tensor::{Accum, Float, Precision, Tensor, parallel};
 
 /// The places in a square, (row, column).
 pub(super) const PHASES: [[usize; 2]; 4] = [[0, 0], [0, 1], [1, 0], [1, 1]];
@@ -57,10 +57,19 @@ fn tile(g: &Geometry) -> usize {
 }
 
 /// `out = conv(x enlarged, w)`, or added to what is there; and finished.
-pub(super) fn convolve<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: &[T], w: &[T], finish: &Finish<T>) {
+pub(super) fn convolve<T: Float>(
+    out: &mut [T],
+    accum: Accum,
+    g: &Geometry,
+    x: &[T],
+    w: &[T],
+    finish: &Finish<T>,
+    precision: Precision,
+) {
     let (c, n, width, tile) = (g.channels, g.out_channels, g.out[1], tile(g));
     let weights = PHASES.map(|phase| weights_at(phase, g, w));
-    let panels = weights.each_ref().map(|w| Panels::dense(w, TAPS * c, n, g.rows() * width));
+    let precision = precision.of_lines([2 * c].into_iter());
+    let panels = weights.each_ref().map(|w| Panels::dense(w, TAPS * c, n, g.rows() * width, precision));
     let row = 2 * width * n;
     let work = 2 * out.len() * TAPS * c;
     parallel::for_each_chunk(out, tile * 2 * row, work, |i, out| {
@@ -99,7 +108,7 @@ pub(super) fn input_gradient<T: Float>(out: &mut [T], accum: Accum, g: &Geometry
         ..*g
     };
     let turned = turned(g, w);
-    kernel::convolve(out, accum, &t, &whole(&t, dy), &turned, &Finish::nothing());
+    kernel::convolve(out, accum, &t, &whole(&t, dy), &turned, &Finish::nothing(), Precision::F32);
     kernel::border_gradient(out, g, &t, dy, &turned);
 }
 
