@@ -55,6 +55,10 @@ impl<'a, T: Float> GradSink<'a, T> {
     pub fn give(&mut self, i: usize, gradient: Tensor<T>) {
         let Some(slot) = self.inputs[i] else { return };
         assert_eq!(*gradient.shape(), self.shapes[slot], "a gradient has the shape of its input");
+        #[cfg(mutants)]
+        if super::regime::mutants::overwrites() {
+            self.slots[slot] = None;
+        }
         match &mut self.slots[slot] {
             Some(sum) => profile::phase("gradient accumulation", || sum.add_assign(&gradient)),
             empty => *empty = Some(gradient),

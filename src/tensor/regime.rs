@@ -212,7 +212,9 @@ pub fn blocks(range: Range<usize>, usual: usize) -> impl Iterator<Item = Range<u
     let runs = {
         let (bug, all) = (mutants::at(Location::caller()), runs.collect::<Vec<_>>());
         let kept = all.clone().into_iter().enumerate();
-        kept.filter(move |(i, _)| bug.is_none_or(|bug| bug.instead(*i, all.len()) == Some(*i))).map(|(_, run)| run)
+        let (count, short) = (all.len(), bug == Some(mutants::Bug::ShortensLast) && all.len() > 1);
+        kept.filter(move |(i, _)| bug.is_none_or(|bug| bug.instead(*i, count) == Some(*i)))
+            .map(move |(i, run)| if short && i + 1 == count { run.start..run.end - 1 } else { run })
     };
     runs
 }

@@ -163,7 +163,7 @@ impl<T: Float> Product<'_, T> {
             Data::Pairs(panels) => {
                 T::pick::<OfPairs>(bf16::product, |_, _| unreachable!("only f32 is packed in bf16"))(&mut self, panels)
             }
-            _ => T::dispatch(self),
+            _ => T::dispatch_vector(self),
         }
     }
 
@@ -356,7 +356,7 @@ impl<T: Float> Gram<'_, T> {
     /// If a slice is too short.
     pub(crate) fn run(self) {
         if self.rows * self.cols * self.count > 0 {
-            T::dispatch(self);
+            T::dispatch_vector(self);
         }
     }
 

@@ -103,7 +103,7 @@ pub(crate) fn copy_run<T: Copy>(to: &mut [T], from: &[T]) {
 }
 
 /// Element types of which there are vectors, for the few kernels that keep vectors in registers across loops of their
-/// own, which the compiler does not find by itself. Run one with [`Vector::dispatch`].
+/// own, which the compiler does not find by itself. Run one with [`Vector::dispatch_vector`].
 pub trait Vector: Copy + 'static {
     /// A vector of the instruction set `S`.
     type V<S: Simd>: Copy;
@@ -112,9 +112,12 @@ pub trait Vector: Copy + 'static {
     /// machine's, in f64 AVX2 at most. f64 is what gradients are checked in, and a third instance of each of its loops
     /// would take a tenth of the time that the crate takes to compile.
     ///
-    /// Write a closure as `#[inline(always)] || ...`, and mark the functions it calls the same way: what is not inlined
-    /// is compiled for the baseline.
-    fn dispatch<K: WithSimd>(kernel: K) -> K::Output;
+    /// Write the closure as `#[inline(always)] || ...`, and mark the functions it calls the same way: what is not inlined
+    /// is compiled for the baseline, where `mul_add` is a call into a library.
+    fn dispatch<R>(kernel: impl FnOnce() -> R) -> R;
+
+    /// The same for a kernel that is written in these vectors.
+    fn dispatch_vector<K: WithSimd>(kernel: K) -> K::Output;
 
     /// Elements in a vector.
     fn lanes<S: Simd>() -> usize;
@@ -141,8 +144,15 @@ macro_rules! vector {
         impl Vector for $t {
             type V<S: Simd> = S::$v;
 
+            // `FnOnce`, and not what pulp makes of it: only of what is asked for as such is the closure itself the
+            // function that is inlined, and not a shim around it.
             #[inline(always)]
-            fn dispatch<K: WithSimd>(kernel: K) -> K::Output {
+            fn dispatch<R>(kernel: impl FnOnce() -> R) -> R {
+                $dispatch(kernel)
+            }
+
+            #[inline(always)]
+            fn dispatch_vector<K: WithSimd>(kernel: K) -> K::Output {
                 $dispatch(kernel)
             }
             #[inline(always)]
@@ -224,7 +234,7 @@ pub(crate) fn lanes<T: Vector>() -> usize {
             T::lanes::<S>()
         }
     }
-    T::dispatch(Lanes::<T>(std::marker::PhantomData))
+    T::dispatch_vector(Lanes::<T>(std::marker::PhantomData))
 }
 
 #[cfg(test)]

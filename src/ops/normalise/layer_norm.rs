@@ -74,7 +74,7 @@ impl<T: Float> WithSimd for Moments<'_, T> {
 fn moments<T: Float>(x: &[T], c: usize, eps: T) -> Vec<[T; 2]> {
     let mut out = vec![[T::ZERO; 2]; x.len() / c];
     if !out.is_empty() {
-        T::dispatch(Moments { x, eps, out: &mut out });
+        T::dispatch_vector(Moments { x, eps, out: &mut out });
     }
     out
 }

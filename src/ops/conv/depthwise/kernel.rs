@@ -122,7 +122,7 @@ pub(crate) fn forward<T: Float>(
     let tile = tile.or(band(width * c * taps));
     parallel::for_each_chunk(y.data, tile * width * stride, 2 * y.rows * c * taps, |i, out| {
         let pass = Pass { window: *window, height, width, first_row: i * tile, w };
-        T::dispatch(Convolve { pass, x, bias, out: &mut *out, stride, accum });
+        T::dispatch_vector(Convolve { pass, x, bias, out: &mut *out, stride, accum });
         done(out);
     });
 }
@@ -347,7 +347,7 @@ pub(crate) fn input_gradient<T: Float>(window: &Window, g: Rows<T>, w: &[T], dx:
     let tile = tile.or(band(window.width * c * kh * kw));
     parallel::for_each_chunk(dx.data, tile * window.width * stride, 2 * g.rows * c * kh * kw, |i, out| {
         let pass = Pass { window: *window, height, width, first_row: i * tile, w };
-        T::dispatch(Gather { pass, g, out, stride, accum });
+        T::dispatch_vector(Gather { pass, g, out, stride, accum });
     });
 }
 
@@ -500,7 +500,7 @@ pub(crate) fn weight_gradient<T: Float>(
         Tensor::build([kh * kw, c], |dw| {
             dw.fill(T::ZERO);
             let pass = Pass { window: *window, height, width, first_row: i * tile, w: &[] };
-            T::dispatch(Weigh { pass, rows: tile.min(rows - i * tile), x, g, dw });
+            T::dispatch_vector(Weigh { pass, rows: tile.min(rows - i * tile), x, g, dw });
         })
     });
     sum_into(dw, accum, &sums);

@@ -275,6 +275,7 @@ impl Checked for UpsampledConv2d {
         };
         let plain = UpsampledConv2d::default();
         let mut cases = vec![
+            case("3x3, several panels of outputs", plain, [1, 2, 2, 1], &[], [3, 37], true),
             case("3x3", plain, [2, 3, 2, 2], &[], [3, 3], true),
             case("3x3, three images", plain, [3, 2, 3, 2], &[1], [3, 2], true),
             case("3x3, one pixel", plain, [1, 1, 1, 2], &[], [3, 2], false),
