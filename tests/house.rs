@@ -88,7 +88,7 @@ fn no_family_of_ops_imports_another() {
 }
 
 #[test]
-fn unsafe_stands_in_one_file_once() {
+fn unsafe_stands_where_it_is_known_to() {
     let mut found = Vec::new();
     for path in sources("src") {
         let text = code(&path);
@@ -97,7 +97,9 @@ fn unsafe_stands_in_one_file_once() {
             found.push((place(&path), blocks));
         }
     }
-    assert_eq!(found, [("tensor/gemm_small.rs".to_owned(), 1)]);
+    // A call into matrixmultiply; the way into a function for one instruction, and vectors that have no constructor.
+    let known = [("tensor/bf16.rs", 2), ("tensor/gemm_small.rs", 1)].map(|(file, blocks)| (file.to_owned(), blocks));
+    assert_eq!(found, known);
 }
 
 /// A size that a kernel cuts its work at is asked for (`tensor::regime`), so that checks can make it small: a constant in a

@@ -474,3 +474,52 @@ fn info_counts_the_published_parameters() {
     assert_eq!(info["parameters"]["encoder"], 22_603_400);
     assert_eq!(info["parameters"]["depth"], 5_266_708);
 }
+
+/// A folder of JPEG frames, a sequence in each folder, of a camera of its own and with depth maps for one of them.
+#[test]
+fn a_folder_of_frames_trains_and_is_measured() {
+    let place = tempfile::tempdir().expect("a folder");
+    let camera = Intrinsics { fx: 0.9, fy: 1.2, cx: 0.45, cy: 0.55 };
+    let frames = 12;
+    let config =
+        StreetConfig { height: 72, width: 96, sequences: 2, frames, intrinsics: camera, ..StreetConfig::default() };
+    let street = Street::render(&config, None);
+    for (sequence, name) in ["first", "second"].into_iter().enumerate() {
+        let folder = place.path().join("frames").join(name);
+        std::fs::create_dir_all(folder.join("depth")).expect("a folder");
+        for frame in 0..frames {
+            street.frame(sequence, frame).save(folder.join(format!("f{frame}.jpg"))).expect("written");
+            let depth = folder.join(format!("depth/f{frame}.png"));
+            parallax::formats::depth_png::write_depth_png(depth, &street.frame_depth(sequence, frame))
+                .expect("written");
+        }
+    }
+    let data = place.path().join("frames");
+    let (data_arg, out) = (data.to_str().expect("UTF-8"), place.path().join("run"));
+    let size = ["--height", "64", "--width", "96", "--batch", "2", "--preset", "pico"];
+    let train = |more: &[&str]| {
+        let mut args = vec!["train", "--data", data_arg, "--steps", "3", "--out", out.to_str().expect("UTF-8")];
+        args.extend(size.iter().chain(more));
+        parallax(&args)
+    };
+    // Nothing says which camera it was.
+    let refused = train(&[]);
+    let said = String::from_utf8_lossy(&refused.stderr);
+    assert!(!refused.status.success() && said.contains("camera.toml") && said.contains("first"), "{said}");
+    let toml = "width = 192\nheight = 144\nfx = 172.8\nfy = 172.8\ncx = 86.4\ncy = 79.2\n";
+    std::fs::write(data.join("camera.toml"), toml).expect("written");
+    let trained = train(&[]);
+    let said = String::from_utf8_lossy(&trained.stderr);
+    assert!(trained.status.success(), "{said}");
+    assert!(said.contains("fx 0.9000, fy 1.2000, cx 0.4500, cy 0.5500") && said.contains("camera.toml"), "{said}");
+    // Of ten samples of each drive the last is set aside, and two before it are given up.
+    assert!(said.contains("on 14 samples"), "{said}");
+    let metrics: RunMetrics =
+        serde_json::from_slice(&std::fs::read(out.join("metrics.json")).expect("metrics")).expect("JSON");
+    assert_eq!((metrics.images, metrics.after.is_some()), (1, true));
+    let eval = parallax(&["eval", "--weights", out.to_str().expect("UTF-8"), "--data", data_arg, "--json"]);
+    let said = String::from_utf8_lossy(&eval.stderr);
+    assert!(eval.status.success(), "{said}");
+    let measured: serde_json::Value = serde_json::from_slice(&eval.stdout).expect("JSON");
+    assert_eq!(measured["images"], 24, "{measured}");
+}

@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 
 use parallax::Result;
 use parallax::data::DataSource;
-use parallax::data::kitti::{Camera, DepthAxis, GroundTruth, Kitti, LeftOut, Options};
+use parallax::data::camera::Camera;
+use parallax::data::frames::{self, Frames};
+use parallax::data::kitti::{DepthAxis, GroundTruth, Kitti, LeftOut, Options, is_kitti};
 use parallax::eval::metrics::{Protocol, Report, STEREO_SCALE, Scale};
 use parallax::eval::predictions::Predictions;
 use parallax::eval::predictor::{Evaluation, Predictor, evaluate, evaluate_predictions};
@@ -13,6 +15,7 @@ use parallax::weights::Weights;
 use serde::Serialize;
 
 use super::progress::Progress;
+use super::sizes::Numbers;
 
 #[derive(clap::Args)]
 #[command(mut_arg("weights", |weights| weights.required(false).required_unless_present("disparities")))]
@@ -23,7 +26,8 @@ pub struct Args {
     /// (not the sigmoid), one map for each frame in the order of the split.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["weights", "allow_partial", "height", "width", "flip"])]
     disparities: Option<PathBuf>,
-    /// Frames to measure on: `street` (with a seed that no run trains on) or a folder in the layout of KITTI raw.
+    /// Frames to measure on: `street` (with a seed that no run trains on) or a folder: in
+    /// the layout of KITTI raw, or (protocol dense) of frames with depth maps, as train takes them.
     #[arg(long, value_name = "street|DIR", default_value = "street")]
     data: String,
     /// List of a folder's frames, lines `FOLDER FRAME SIDE` [default: all].
@@ -38,12 +42,15 @@ pub struct Args {
     /// Flip post-processing: predict on the mirrored picture too, and join both.
     #[arg(long)]
     flip: bool,
+    /// Numbers in which products are taken; bf16 where the processor has AVX-512 BF16.
+    #[arg(long, value_enum, default_value = "f32")]
+    precision: Numbers,
     /// Seed of the street.
     #[arg(long, value_name = "N", default_value_t = 3_000_000)]
     seed: u64,
     /// Print one JSON object: what was measured, how, and the metrics of all and of each image.
     ///
-    /// weights or disparities, data, split, protocol, scale, flip, height, width (of the predictions), frames, images
+    /// weights or disparities, data, split, protocol, scale, flip, precision, height, width (of the predictions), frames, images
     /// (those that were measured), skipped: [{why, frames, first}], abs_rel, sq_rel, rmse, rmse_log, a1, a2, a3,
     /// ratio_median, ratio_std, per_image, without_pixels, without_depth.
     #[arg(long, verbatim_doc_comment)]
@@ -66,6 +73,7 @@ struct Measured {
     protocol: Protocol,
     scale: String,
     flip: bool,
+    precision: Option<Numbers>,
     height: usize,
     width: usize,
     /// All that were looked at: those that were measured, and those that were not.
@@ -104,7 +112,8 @@ pub fn run(args: Args) -> Result<()> {
         }
         None => {
             let Weights { model, params, setup, .. } = args.weights.load()?;
-            (By::Network(Box::new(Predictor::new(&model, &params, &setup))), (setup.height, setup.width))
+            let predictor = Predictor::new(&model, &params, &setup).with_precision(args.precision.checked()?)?;
+            (By::Network(Box::new(predictor)), (setup.height, setup.width))
         }
     };
     let (data, left_out) = args.open(height, width)?;
@@ -119,6 +128,7 @@ pub fn run(args: Args) -> Result<()> {
         By::File(predictions) => evaluate_predictions(predictions, data.as_ref(), how, seen)?,
     };
     progress.finish();
+    let precision = args.disparities.is_none().then_some(args.precision);
     let measured = Measured {
         weights: args.disparities.is_none().then(|| args.weights.name()),
         disparities: args.disparities,
@@ -130,6 +140,7 @@ pub fn run(args: Args) -> Result<()> {
         protocol: args.protocol,
         scale: args.scale.to_string(),
         flip: args.flip,
+        precision,
         height,
         width,
         frames: data.len() + left_out.without_depth,
@@ -146,10 +157,11 @@ pub fn run(args: Args) -> Result<()> {
 fn print(measured: &Measured, scale: Scale) {
     let Measured { report, height, width, .. } = measured;
     let flipped = if measured.flip { ", joined with the mirrored picture's" } else { "" };
+    let numbers = if measured.precision == Some(Numbers::Bf16) { ", products in bf16" } else { "" };
     match (&measured.weights, &measured.disparities) {
         (_, Some(file)) => say!("file      {}, maps of {width}x{height}", file.display()),
         (weights, None) => {
-            say!("weights   {}, maps of {width}x{height}{flipped}", weights.as_deref().unwrap_or_default());
+            say!("weights   {}, maps of {width}x{height}{flipped}{numbers}", weights.as_deref().unwrap_or_default());
         }
     }
     let listed = measured.split.as_ref().map_or_else(String::new, |list| format!(", frames of {}", list.display()));
@@ -195,6 +207,13 @@ impl Args {
             let street = StreetConfig { height, width, sequences: 8, seed: self.seed, ..StreetConfig::default() };
             return Ok((Box::new(Street::render(&street, None)), LeftOut::default()));
         }
+        let root = Path::new(&self.data);
+        if self.protocol == Protocol::Dense && root.is_dir() && !is_kitti(root)? {
+            let camera = Camera::Fov { degrees: 90.0 };
+            let options = frames::Options { neighbours: false, with_depth: true, camera, ..frames::Options::default() };
+            let frames = Frames::open(root, self.split.as_deref(), [height, width], options)?;
+            return Ok((Box::new(frames), LeftOut::default()));
+        }
         let ground_truth = match self.protocol {
             Protocol::Eigen => GroundTruth::Lidar(DepthAxis::LidarX),
             Protocol::EigenCameraZ => GroundTruth::Lidar(DepthAxis::CameraZ),
@@ -203,7 +222,7 @@ impl Args {
         // Depth is compared pixel by pixel: whichever camera took the pictures.
         let camera = Camera::KittiPublished;
         let options = Options { neighbours: false, ground_truth, camera, ..Options::default() };
-        let kitti = Kitti::open(Path::new(&self.data), self.split.as_deref(), height, width, options)?;
+        let kitti = Kitti::open(root, self.split.as_deref(), height, width, options)?;
         let left_out = kitti.left_out().clone();
         Ok((Box::new(kitti), left_out))
     }

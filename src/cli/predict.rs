@@ -23,6 +23,7 @@ use parallax::{Error, Result};
 use serde::Serialize;
 
 use super::progress::Progress;
+use super::sizes::Numbers;
 
 mod outputs;
 
@@ -71,6 +72,9 @@ pub struct Args {
     /// Flip post-processing: predict on the mirrored picture too, and join both. Twice the time, better borders.
     #[arg(long, help_heading = "Network")]
     flip: bool,
+    /// Numbers in which products are taken; bf16 where the processor has AVX-512 BF16.
+    #[arg(long, value_enum, default_value = "f32", help_heading = "Network")]
+    precision: Numbers,
     /// Factor that depths are multiplied by [default: 1].
     #[arg(long, value_name = "FACTOR", group = "unit", help_heading = "Scale (one of)", value_parser = above_zero)]
     scale: Option<f64>,
@@ -165,7 +169,7 @@ pub fn run(args: Args) -> Result<()> {
     let Weights { model, params, setup, .. } = args.weights.load()?;
     let made = !args.out.exists();
     check_writable(&args.out)?;
-    let predictor = Predictor::new(&model, &params, &setup);
+    let predictor = Predictor::new(&model, &params, &setup).with_precision(args.precision.checked()?)?;
     let size = (setup.height, setup.width);
     let mut progress = Progress::new("pictures", jobs.len() as u64);
     let (mut done, mut failed) = (Vec::new(), Vec::new());

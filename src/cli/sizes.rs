@@ -37,7 +37,8 @@ impl Sizes {
 }
 
 /// Numbers in which products of convolutions and linear layers are taken, in inference.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Numbers {
     /// f32.
     F32,

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
-use parallax::data::kitti::Camera;
+use parallax::data::camera::Camera;
 use parallax::monovit::{Preset, Setup};
 use parallax::train::cost::check_memory;
 use parallax::train::data::{self, STREET};
@@ -20,13 +20,18 @@ use super::progress::Progress;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Training frames: `street` (rendered by the program) or a folder in the layout of KITTI raw [default: street].
+    /// Training frames: `street` (rendered by the program) or a folder [default: street].
+    ///
+    /// A folder in the layout of KITTI raw; or any folder of PNG, JPEG or WebP frames, in the order in which people number
+    /// them, each folder inside it a sequence of its own. `camera.toml` among the frames says which camera took them.
+    /// Depth maps, if there are any, lie in a folder `depth` beside the frames, under their names.
     #[arg(long, value_name = "street|DIR")]
     data: Option<String>,
-    /// List of a folder's frames to train on, lines `FOLDER FRAME SIDE` [default: all that have both neighbours].
+    /// List of a folder's frames to train on, lines `FOLDER FRAME`, or of KITTI raw `FOLDER FRAME SIDE`
+    /// [default: all that have both neighbours].
     #[arg(long, value_name = "FILE")]
     split: Option<PathBuf>,
-    /// List of a folder's frames to validate on [default: every tenth training frame is set aside].
+    /// List of a folder's frames to validate on [default: the last tenth of each drive, with a gap before it].
     #[arg(long, value_name = "FILE")]
     val_split: Option<PathBuf>,
     /// Horizontal field of view, in degrees, of the camera that took a folder's pictures [default: from camera.toml

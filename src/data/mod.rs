@@ -1,8 +1,13 @@
-//! Where frames come from: the embedded street, KITTI raw, folders; and what is done to them before training.
+//! Where frames come from: the embedded street, KITTI raw, any folder; and what is done to them before training.
 
+pub mod aside;
 pub mod augment;
 pub mod batch;
+mod cache;
+pub mod camera;
+pub mod frames;
 pub mod inputs;
+
 pub mod kitti;
 pub mod pyramid;
 pub mod resize;
@@ -15,6 +20,15 @@ use image::RgbImage;
 use crate::Result;
 use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
+
+/// Where a sample lies in time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Place {
+    /// The recording: cameras side by side are one.
+    pub sequence: usize,
+    /// The number of the target frame in it.
+    pub frame: usize,
+}
 
 /// Samples for training and evaluation: each a target frame with its neighbours in time.
 pub trait DataSource: Send + Sync {
@@ -49,6 +63,11 @@ pub trait DataSource: Send + Sync {
     /// The samples that were left out when the data were opened because a frame of theirs cannot be read: name, and why.
     fn unreadable(&self) -> &[(String, String)] {
         &[]
+    }
+
+    /// Where a sample lies: frames that follow one another in a sequence look alike.
+    fn place(&self, sample: usize) -> Place {
+        Place { sequence: 0, frame: sample }
     }
 
     /// Ground-truth depth of the target frame at its own size, where there is one.
@@ -89,6 +108,9 @@ impl DataSource for Subset {
     }
     fn unreadable(&self) -> &[(String, String)] {
         self.data.unreadable()
+    }
+    fn place(&self, sample: usize) -> Place {
+        self.data.place(self.samples[sample])
     }
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {
         self.data.depth(self.samples[sample])

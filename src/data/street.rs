@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use image::RgbImage;
 
-use super::DataSource;
+use super::{DataSource, Place};
 use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
 use crate::street::Street;
@@ -34,6 +34,11 @@ impl DataSource for Street {
 
     fn intrinsics(&self, _sample: usize) -> Intrinsics {
         self.config().intrinsics
+    }
+
+    fn place(&self, sample: usize) -> Place {
+        let (sequence, frame) = self.locate(sample);
+        Place { sequence, frame }
     }
 
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {

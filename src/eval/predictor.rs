@@ -12,7 +12,7 @@ use crate::depth::{Disparity, InverseDepth};
 use crate::error::{Error, Result};
 use crate::monovit::{MonoVit, Setup};
 use crate::nn::{Folded, Params};
-use crate::tensor::profile;
+use crate::tensor::{Precision, profile};
 use crate::weights::{self, Need, Weights};
 use image::RgbImage;
 
@@ -57,6 +57,20 @@ impl Predictor {
     /// The networks with these weights; `setup` gives the size of their pictures and the range of depths.
     pub fn new(model: &MonoVit, params: &Params<f32>, setup: &Setup) -> Self {
         Predictor { model: model.clone(), params: Folded::new(params), setup: *setup }
+    }
+
+    /// The same, with products of convolutions and linear layers in other numbers. In bf16 depths move by some 0.3 % on
+    /// average and by 1 % in one pixel of a hundred; the time is 0.7 of f32's for the small network.
+    ///
+    /// # Errors
+    /// If this machine has not the instruction: see [`Precision::is_available`].
+    pub fn with_precision(mut self, precision: Precision) -> Result<Self> {
+        if !precision.is_available() {
+            let message = format!("{precision:?} needs a processor with AVX-512 BF16 (which PARALLAX_SIMD may forbid)");
+            return Err(Error::setting("precision", message));
+        }
+        self.params = self.params.with_precision(precision);
+        Ok(self)
     }
 
     /// Reads weights: a run's folder, or any file or folder that [`weights::load`] takes.

@@ -6,7 +6,9 @@ use std::sync::Arc;
 
 use super::recipe::RunConfig;
 use super::run::RunData;
-use crate::data::kitti::{Kitti, Options};
+use crate::data::aside::set_aside;
+use crate::data::frames::{self, Frames};
+use crate::data::kitti::{self, Kitti, is_kitti};
 use crate::data::{DataSource, Subset};
 use crate::error::{Error, Result};
 use crate::street::{Street, StreetConfig};
@@ -57,19 +59,34 @@ fn street(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + S
     }
 }
 
+/// The samples of a folder that a list names, or all: KITTI raw by its layout, or any folder of frames.
+fn samples(config: &RunConfig, list: Option<&Path>) -> Result<Arc<dyn DataSource>> {
+    let (root, size) = (Path::new(&config.data), [config.height, config.width]);
+    let RunConfig { camera, skip_bad_frames, .. } = *config;
+    if !root.is_dir() {
+        return Err(Error::file(
+            root,
+            "expected a folder of frames, or one in the layout of KITTI raw; check the path",
+        ));
+    }
+    if is_kitti(root)? {
+        let options = kitti::Options { camera, skip_bad_frames, ..kitti::Options::default() };
+        return Ok(Arc::new(Kitti::open(root, list, size[0], size[1], options)?));
+    }
+    let options = frames::Options { camera, skip_bad_frames, ..frames::Options::default() };
+    Ok(Arc::new(Frames::open(root, list, size, options)?))
+}
+
 fn folder(config: &RunConfig) -> Result<RunData> {
-    let root = Path::new(&config.data);
-    let options = Options { camera: config.camera, skip_bad_frames: config.skip_bad_frames, ..Options::default() };
-    let open = |split: Option<&Path>| Kitti::open(root, split, config.height, config.width, options);
-    let all: Arc<dyn DataSource> = Arc::new(open(config.split.as_deref())?);
+    let all = samples(config, config.split.as_deref())?;
     let (train, aside): (Arc<dyn DataSource>, Arc<dyn DataSource>) = match &config.val_split {
         Some(split) => {
-            let aside: Arc<dyn DataSource> = Arc::new(open(Some(split))?);
+            let aside = samples(config, Some(split))?;
             apart(all.as_ref(), aside.as_ref(), split)?;
             (all, aside)
         }
         None => {
-            let (aside, rest) = (0..all.len()).partition(|i| i % 10 == 9);
+            let (rest, aside) = set_aside(all.as_ref());
             (Arc::new(Subset::new(all.clone(), rest)), Arc::new(Subset::new(all, aside)))
         }
     };

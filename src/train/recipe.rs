@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::rotations::{RotationPlan, Rotations};
 use crate::data::batch::Augment;
-use crate::data::kitti::Camera;
+use crate::data::camera::Camera;
 use crate::error::{Error, Result};
 use crate::formats::bounded::{MAX_SETTINGS, read_text};
 use crate::monovit::loss::LossConfig;
@@ -198,7 +198,7 @@ pub struct RunConfig {
     pub steps: u64,
     /// Seed of everything random.
     pub seed: u64,
-    /// `street`, or a folder in the layout of KITTI raw.
+    /// `street`, or a folder: in the layout of KITTI raw, or of frames ([`data::frames`](crate::data::frames)).
     pub data: String,
     /// List of the frames to train on; without it, all frames.
     pub split: Option<PathBuf>,

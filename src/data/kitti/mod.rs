@@ -10,29 +10,28 @@
 //! Whatever can be wrong with a data set is found by [`Kitti::open`], before any time is spent on training.
 
 mod calibration;
-mod camera;
 mod lidar;
 mod scan;
 mod split;
 
 use std::collections::{BTreeMap, HashMap, HashSet, btree_map};
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use image::RgbImage;
 
 use crate::formats::depth_png::read_depth_png;
 pub use calibration::Calibration;
-pub use camera::Camera;
 pub use lidar::{DepthAxis, project_scan, read_scan};
 pub use split::{Side, SplitLine, read_split};
 
-use super::DataSource;
 use super::augment::flip_intrinsics;
-use super::resize::lanczos;
+use super::cache::Pictures;
+use super::camera::{self, Camera};
+use super::{DataSource, Place};
 use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
-use crate::formats::picture::{check_picture, read_picture};
+use crate::formats::picture::check_picture;
 use crate::{Error, Result};
 
 /// Where ground-truth depth comes from.
@@ -150,25 +149,16 @@ impl Drive {
     }
 }
 
-/// Frames kept at the size of the networks, up to a number of bytes; what is in stays in.
-#[derive(Default)]
-struct Cache {
-    pictures: HashMap<Frame, Arc<RgbImage>>,
-    bytes: usize,
-}
-
 /// KITTI raw as a [`DataSource`].
 pub struct Kitti {
     drives: Vec<Drive>,
     samples: Vec<Frame>,
-    height: u32,
-    width: u32,
     options: Options,
     /// Of each drive and side.
     cameras: BTreeMap<(usize, Side), camera::Found>,
     left_out: LeftOut,
     unreadable: Vec<(String, String)>,
-    cache: Mutex<Cache>,
+    pictures: Pictures<Frame>,
 }
 
 /// Frames of a folder that are no samples.
@@ -180,6 +170,14 @@ pub struct LeftOut {
     pub without_depth: usize,
     /// Where the first one's ground truth was looked for.
     pub first_depth: Option<PathBuf>,
+}
+
+/// Whether a folder has the layout of KITTI raw: a drive with a folder of frames of a colour camera.
+///
+/// # Errors
+/// If the folder cannot be read.
+pub fn is_kitti(root: &Path) -> Result<bool> {
+    Ok(!scan::drives(root)?.is_empty())
 }
 
 impl Kitti {
@@ -197,13 +195,11 @@ impl Kitti {
         let mut kitti = Kitti {
             drives: Vec::new(),
             samples: Vec::new(),
-            height: side_of_picture("height", height)?,
-            width: side_of_picture("width", width)?,
             options,
             cameras: BTreeMap::new(),
             left_out: LeftOut::default(),
             unreadable: Vec::new(),
-            cache: Mutex::default(),
+            pictures: Pictures::new(height, width, options.cache_bytes)?,
         };
         match split {
             Some(split) => kitti.take_split(root, split)?,
@@ -221,7 +217,10 @@ impl Kitti {
                 let frame = self.samples[sample];
                 let path = self.drives[drive].picture(frame.number, side).unwrap_or_else(|expected| expected);
                 let size = check_picture(&path)?;
-                place.insert(self.options.camera.resolve(root, &self.drives[drive].path, side, size)?);
+                let calibrated = || calibrated(self.drives[drive].day(), side);
+                let calibration: Option<&dyn Fn() -> Result<camera::Found>> =
+                    Calibration::has_cameras(self.drives[drive].day()).then_some(&calibrated as _);
+                place.insert(self.options.camera.resolve(root, &self.drives[drive].path, size, calibration)?);
             }
         }
         Ok(())
@@ -483,27 +482,7 @@ impl Kitti {
     }
 
     fn picture(&self, frame: Frame, target: Frame) -> Result<Arc<RgbImage>> {
-        if let Some(picture) = self.cache().pictures.get(&frame) {
-            return Ok(picture.clone());
-        }
-        let picture = read_picture(&self.picture_path(frame, target)?)?;
-        let picture = Arc::new(match picture.dimensions() == (self.width, self.height) {
-            true => picture,
-            false => lanczos(&picture, self.width, self.height),
-        });
-        let bytes = picture.as_raw().len();
-        let mut cache = self.cache();
-        // Another thread may have decoded it in the meantime.
-        if cache.bytes + bytes <= self.options.cache_bytes && !cache.pictures.contains_key(&frame) {
-            cache.pictures.insert(frame, picture.clone());
-            cache.bytes += bytes;
-        }
-        Ok(picture)
-    }
-
-    /// A thread that panicked with the lock held leaves whole entries behind: they can be used.
-    fn cache(&self) -> std::sync::MutexGuard<'_, Cache> {
-        self.cache.lock().unwrap_or_else(PoisonError::into_inner)
+        self.pictures.get(frame, || self.picture_path(frame, target))
     }
 
     fn scan_depth(&self, frame: Frame, axis: DepthAxis) -> Result<DepthMap> {
@@ -516,6 +495,12 @@ impl Kitti {
         let (width, height) = calibration.size;
         Ok(project_scan(&points, &projection, width, height, axis))
     }
+}
+
+/// What the calibration of a day says of a camera.
+fn calibrated(day: &Path, side: Side) -> Result<camera::Found> {
+    let found = Calibration::intrinsics_of(day, side)?;
+    Ok(camera::Found::measured(found, day.join(calibration::CAMERAS).display().to_string()))
 }
 
 impl DataSource for Kitti {
@@ -547,14 +532,12 @@ impl DataSource for Kitti {
     }
 
     fn cameras(&self) -> Vec<String> {
-        let mut said: Vec<String> = Vec::new();
-        for camera::Found { intrinsics: k, place, .. } in self.cameras.values() {
-            let line = format!("fx {:.4}, fy {:.4}, cx {:.4}, cy {:.4} of the size: {place}", k.fx, k.fy, k.cx, k.cy);
-            if !said.contains(&line) {
-                said.push(line);
-            }
-        }
-        said
+        camera::in_words(self.cameras.values())
+    }
+
+    fn place(&self, sample: usize) -> Place {
+        let frame = self.samples[sample];
+        Place { sequence: frame.drive, frame: frame.number as usize }
     }
 
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {
@@ -573,13 +556,3 @@ impl DataSource for Kitti {
         }
     }
 }
-
-fn side_of_picture(name: &str, size: usize) -> Result<u32> {
-    match u32::try_from(size) {
-        Ok(size) if (1..=1 << 14).contains(&size) => Ok(size),
-        _ => Err(Error::setting(name, format!("expected 1 to {} pixels, found {size}", 1 << 14))),
-    }
-}
-
-#[cfg(test)]
-mod tests;

@@ -207,7 +207,8 @@ impl Checked for LayerNorm {
     }
 
     fn draw(random: &mut Random) -> Option<Case<Self>> {
-        let c = random.pick(&[2, 3, 7, 16, 33]);
+        // Of two channels little is left to have a gradient.
+        let c = random.pick(&[3, 7, 16, 33]);
         let op = LayerNorm { eps: random.pick(&[1e-5, 1e-3]), tile: Tile::of(random.extreme(0, 5)) };
         let x = [random.extreme(1, 3), random.extreme(1, 7), c];
         Some(Case::drawn(op, [Input::random("x", x), Input::random("weight", [c]), Input::random("bias", [c])]))

@@ -4,8 +4,6 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::calibration::Calibration;
-use super::split::Side;
 use crate::camera::Intrinsics;
 use crate::formats::bounded::{MAX_SETTINGS, read_text};
 use crate::formats::picture::is_size;
@@ -53,13 +51,25 @@ pub(super) struct Found {
 }
 
 impl Found {
-    fn measured(intrinsics: Intrinsics, place: impl Into<String>) -> Found {
+    pub(super) fn measured(intrinsics: Intrinsics, place: impl Into<String>) -> Found {
         Found { intrinsics, place: place.into(), published: false }
     }
 
     fn published(place: impl Into<String>) -> Found {
         Found { intrinsics: Intrinsics::KITTI, place: place.into(), published: true }
     }
+}
+
+/// Cameras in words, each once.
+pub(super) fn in_words<'a>(cameras: impl Iterator<Item = &'a Found>) -> Vec<String> {
+    let mut said: Vec<String> = Vec::new();
+    for Found { intrinsics: k, place, .. } in cameras {
+        let line = format!("fx {:.4}, fy {:.4}, cx {:.4}, cy {:.4} of the size: {place}", k.fx, k.fy, k.cx, k.cy);
+        if !said.contains(&line) {
+            said.push(line);
+        }
+    }
+    said
 }
 
 /// Width over height of KITTI's pictures.
@@ -83,16 +93,27 @@ struct CameraFile {
 
 impl Camera {
     /// The intrinsics of a drive's pictures, which are `width x height`, and where they were found; `root` is the folder
-    /// of all data.
+    /// of all data, `calibration` what the data set's own files say, where it has any.
     ///
     /// # Errors
     /// If nothing is known of the camera, or what is said cannot be.
-    pub(super) fn resolve(self, root: &Path, drive: &Path, side: Side, (width, height): (u32, u32)) -> Result<Found> {
+    pub(super) fn resolve(
+        self,
+        root: &Path,
+        drive: &Path,
+        (width, height): (u32, u32),
+        calibration: Option<&dyn Fn() -> Result<Found>>,
+    ) -> Result<Found> {
         let size = [f64::from(width), f64::from(height)];
-        let day = drive.parent().unwrap_or(drive);
         match self {
             Camera::KittiPublished => Ok(Found::published("KITTI's published constants")),
-            Camera::Calibrated => calibrated(day, side),
+            Camera::Calibrated => match calibration {
+                Some(calibrated) => calibrated(),
+                None => Err(Error::file(
+                    drive,
+                    "has no calibration: expected calib_cam_to_cam.txt in the folder of its day",
+                )),
+            },
             Camera::Fov { degrees } => {
                 let found = of_fov(degrees, size).map_err(|why| Error::setting("camera.degrees", why))?;
                 Ok(Found::measured(found, format!("a field of view of {degrees} degrees")))
@@ -106,8 +127,8 @@ impl Camera {
                 if let Some(file) = above.map(|folder| folder.join(FILE)).find(|file| file.is_file()) {
                     return Ok(Found::measured(read(&file, size)?, file.display().to_string()));
                 }
-                if Calibration::has_cameras(day) {
-                    return calibrated(day, side);
+                if let Some(calibrated) = calibration {
+                    return calibrated();
                 }
                 if ((size[0] / size[1]) / KITTI_ASPECT - 1.0).abs() < 0.1 {
                     return Ok(Found::published("KITTI's published constants, for want of a calibration"));
@@ -121,11 +142,6 @@ impl Camera {
             }
         }
     }
-}
-
-fn calibrated(day: &Path, side: Side) -> Result<Found> {
-    let found = Calibration::intrinsics_of(day, side)?;
-    Ok(Found::measured(found, day.join(super::calibration::CAMERAS).display().to_string()))
 }
 
 /// Reads `camera.toml`, for pictures of a size.
@@ -196,7 +212,7 @@ mod tests {
         if let Some(text) = text {
             fs::write(drive.join(FILE), text).unwrap();
         }
-        camera.resolve(place.path(), &drive, Side::Left, size)
+        camera.resolve(place.path(), &drive, size, None)
     }
 
     #[test]

@@ -1,0 +1,68 @@
+//! Pictures at the size that the networks see, read once as far as memory is given for them.
+
+use std::collections::HashMap;
+use std::hash::Hash;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use image::RgbImage;
+
+use super::resize::lanczos;
+use crate::formats::picture::read_picture;
+use crate::{Error, Result};
+
+/// Frames of a size, kept up to a number of bytes; what is in stays in.
+pub(super) struct Pictures<K> {
+    width: u32,
+    height: u32,
+    most_bytes: usize,
+    kept: Mutex<Kept<K>>,
+}
+
+struct Kept<K> {
+    pictures: HashMap<K, Arc<RgbImage>>,
+    bytes: usize,
+}
+
+impl<K: Eq + Hash> Pictures<K> {
+    /// Pictures of `height x width` pixels, of which at most `most_bytes` are kept.
+    ///
+    /// # Errors
+    /// If a side is 0 or longer than 16384.
+    pub(super) fn new(height: usize, width: usize, most_bytes: usize) -> Result<Self> {
+        let kept = Mutex::new(Kept { pictures: HashMap::new(), bytes: 0 });
+        Ok(Pictures { width: side("width", width)?, height: side("height", height)?, most_bytes, kept })
+    }
+
+    /// A frame, from the file that `path` gives if it is not kept.
+    pub(super) fn get(&self, key: K, path: impl FnOnce() -> Result<PathBuf>) -> Result<Arc<RgbImage>> {
+        if let Some(picture) = self.kept().pictures.get(&key) {
+            return Ok(picture.clone());
+        }
+        let picture = read_picture(&path()?)?;
+        let picture = Arc::new(match picture.dimensions() == (self.width, self.height) {
+            true => picture,
+            false => lanczos(&picture, self.width, self.height),
+        });
+        let bytes = picture.as_raw().len();
+        let mut kept = self.kept();
+        // Another thread may have decoded it in the meantime.
+        if kept.bytes + bytes <= self.most_bytes && !kept.pictures.contains_key(&key) {
+            kept.pictures.insert(key, picture.clone());
+            kept.bytes += bytes;
+        }
+        Ok(picture)
+    }
+
+    /// A thread that panicked with the lock held leaves whole entries behind: they can be used.
+    fn kept(&self) -> MutexGuard<'_, Kept<K>> {
+        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn side(name: &str, size: usize) -> Result<u32> {
+    match u32::try_from(size) {
+        Ok(size) if (1..=1 << 14).contains(&size) => Ok(size),
+        _ => Err(Error::setting(name, format!("expected 1 to {} pixels, found {size}", 1 << 14))),
+    }
+}
