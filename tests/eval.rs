@@ -118,7 +118,11 @@ fn missing_depth_is_not_missing_frames() {
     fails(&[&flags[..], &["--split", text(&split)]].concat(), 1, &words);
     let empty = place.path().join("empty");
     std::fs::create_dir(&empty).expect("made");
-    fails(&["eval", "--weights", text(weights), "--data", text(&empty)], 1, &["no frames found", "image_02/data"]);
+    fails(
+        &["eval", "--weights", text(weights), "--data", text(&empty)],
+        1,
+        &["empty", "holds no PNG, JPEG or WebP pictures"],
+    );
 }
 
 #[test]

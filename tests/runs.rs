@@ -508,6 +508,21 @@ fn a_folder_of_frames_trains_and_is_measured() {
     assert!(!refused.status.success() && said.contains("camera.toml") && said.contains("first"), "{said}");
     let toml = "width = 192\nheight = 144\nfx = 172.8\nfy = 172.8\ncx = 86.4\ncy = 79.2\n";
     std::fs::write(data.join("camera.toml"), toml).expect("written");
+    let sheet = place.path().join("sheet.png");
+    let checked = parallax(&["data", "check", data_arg, "--sheet", sheet.to_str().expect("UTF-8")]);
+    let said = String::from_utf8_lossy(&checked.stdout);
+    assert!(checked.status.success() && said.contains("14 samples to train on, 2 to be set aside"), "{said}");
+    assert!(said.contains("fx 0.9000") && !said.contains("look at this"), "{said}");
+    assert_eq!(parallax::formats::picture::read_picture(&sheet).expect("a picture").dimensions(), (8 * 320, 3 * 96));
+    let bad = data.join("second/f3.jpg");
+    let whole = std::fs::read(&bad).expect("a frame");
+    std::fs::write(&bad, b"no picture").expect("written");
+    let checked = parallax(&["data", "check", data_arg]);
+    let said = String::from_utf8_lossy(&checked.stdout);
+    assert!(checked.status.success() && said.contains("look at this: 1 frames") && said.contains("f3"), "{said}");
+    std::fs::write(&bad, whole).expect("written");
+    fails(&["data", "check", bad.to_str().expect("UTF-8")], 1, &["f3.jpg", "ffmpeg"]);
+
     let trained = train(&[]);
     let said = String::from_utf8_lossy(&trained.stderr);
     assert!(trained.status.success(), "{said}");

@@ -13,6 +13,7 @@ macro_rules! note {
 mod ablation;
 mod attention;
 mod bench;
+mod camera;
 mod convert;
 mod data;
 mod eval;

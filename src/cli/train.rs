@@ -5,7 +5,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
-use parallax::data::camera::Camera;
 use parallax::monovit::{Preset, Setup};
 use parallax::train::cost::check_memory;
 use parallax::train::data::{self, STREET};
@@ -16,6 +15,7 @@ use parallax::weights::{self, preset_of};
 use parallax::{Error, Result};
 
 use super::ablation;
+use super::camera::CameraArgs;
 use super::progress::Progress;
 
 #[derive(clap::Args)]
@@ -34,18 +34,8 @@ pub struct Args {
     /// List of a folder's frames to validate on [default: the last tenth of each drive, with a gap before it].
     #[arg(long, value_name = "FILE")]
     val_split: Option<PathBuf>,
-    /// Horizontal field of view, in degrees, of the camera that took a folder's pictures [default: from camera.toml
-    /// among the data (width, height, fx, fy, cx, cy in pixels, or fov), or else from the calibration].
-    #[arg(long, value_name = "DEGREES", conflicts_with_all = ["intrinsics", "camera"])]
-    fov: Option<f64>,
-    /// Focal lengths and principal point of that camera, in pixels of the pictures as they are stored [default: as for
-    /// --fov].
-    #[arg(long, value_name = "FX,FY,CX,CY", value_parser = super::pinhole, conflicts_with = "camera")]
-    intrinsics: Option<[f64; 4]>,
-    /// A camera by name: KITTI's published constants (fx 0.58, fy 1.92 of the size) whatever the data say, or the
-    /// calibration and nothing else [default: as for --fov].
-    #[arg(long, value_name = "kitti-published|calibrated")]
-    camera: Option<NamedCamera>,
+    #[command(flatten)]
+    lens: CameraArgs,
     /// Size of the networks [default: nano, or that of the weights to start from].
     #[arg(long)]
     preset: Option<Preset>,
@@ -169,13 +159,6 @@ fn skipped(run: &Run) -> String {
         (n, Some(first)) => format!("; {n} samples were skipped because a frame cannot be read, the first: {first}"),
         _ => String::new(),
     }
-}
-
-/// Cameras that are called by a name.
-#[derive(Clone, Copy, clap::ValueEnum)]
-enum NamedCamera {
-    KittiPublished,
-    Calibrated,
 }
 
 /// Ctrl-C: whether it was pressed, and whether there is a step to be waited for.
@@ -327,9 +310,9 @@ impl Args {
             ("--learning-rate", self.learning_rate.is_some()),
             ("--seed", self.seed.is_some()),
             ("--val-split", self.val_split.is_some()),
-            ("--fov", self.fov.is_some()),
-            ("--intrinsics", self.intrinsics.is_some()),
-            ("--camera", self.camera.is_some()),
+            ("--fov", self.lens.fov.is_some()),
+            ("--intrinsics", self.lens.intrinsics.is_some()),
+            ("--camera", self.lens.camera.is_some()),
             ("--allow-partial", self.allow_partial),
             ("--log-every", self.log_every.is_some()),
             ("--checkpoint-every", self.checkpoint_every.is_some()),
@@ -388,13 +371,7 @@ fn configuration(args: &Args) -> Result<RunConfig> {
     }
     c.allow_partial |= args.allow_partial;
     c.skip_bad_frames |= args.skip_bad_frames;
-    c.camera = match (args.intrinsics, args.fov, args.camera) {
-        (Some([fx, fy, cx, cy]), ..) => Camera::Pixels { fx, fy, cx, cy },
-        (None, Some(degrees), _) => Camera::Fov { degrees },
-        (None, None, Some(NamedCamera::KittiPublished)) => Camera::KittiPublished,
-        (None, None, Some(NamedCamera::Calibrated)) => Camera::Calibrated,
-        (None, None, None) => c.camera,
-    };
+    c.camera = args.lens.or(c.camera);
     args.networks.apply(&mut c.ablation);
     args.loss.apply(&mut c.loss);
     if let Some(rate) = args.learning_rate {

@@ -12,7 +12,7 @@ const GAP: usize = 2;
 
 /// Samples to train on, and samples that are set aside: the last tenth of each recording, with a gap before it, so that no
 /// frame of one kind is a frame or neighbour of the other. Of recordings with fewer frames than eight, which would lose
-/// too many, every tenth is set aside as a whole; a single one gives its last frame if that leaves any.
+/// too many, every tenth is set aside as a whole.
 ///
 /// Two cameras of one recording see the same things at the same time, and are cut at the same frame.
 pub fn set_aside(data: &dyn DataSource) -> (Vec<usize>, Vec<usize>) {
@@ -25,7 +25,7 @@ pub fn set_aside(data: &dyn DataSource) -> (Vec<usize>, Vec<usize>) {
     let mut cuts: BTreeMap<usize, usize> = BTreeMap::new();
     for (&sequence, frames) in &recordings {
         let n = frames.len();
-        let aside = if n >= 8 || recordings.len() == 1 && n > 1 + GAP {
+        let aside = if n >= 8 {
             n.div_ceil(SHARE)
         } else {
             short += 1;
@@ -91,7 +91,7 @@ mod tests {
 
     #[test]
     fn no_frame_of_one_kind_is_a_frame_or_neighbour_of_the_other() {
-        for lengths in [&[100][..], &[40, 9, 8, 25], &[5; 23], &[4], &[8], &[30, 3]] {
+        for lengths in [&[100][..], &[40, 9, 8, 25], &[5; 23], &[8], &[30, 3]] {
             let data = of(lengths);
             let (train, aside) = set_aside(&data);
             assert!(!train.is_empty() && !aside.is_empty(), "{lengths:?}: {} and {}", train.len(), aside.len());
@@ -110,7 +110,7 @@ mod tests {
         let (train, aside) = set_aside(&data);
         assert_eq!((train.len(), aside.len()), (150 - 15 - 4, 15));
         // Too few to set any aside.
-        assert_eq!(set_aside(&of(&[3])), (vec![0, 1, 2], vec![]));
+        assert_eq!(set_aside(&of(&[7])), ((0..7).collect(), vec![]));
     }
 
     #[test]

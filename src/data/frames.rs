@@ -12,6 +12,7 @@
 //! are what depth is learnt from.
 
 use std::collections::BTreeMap;
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -32,6 +33,11 @@ use crate::{Error, Result};
 const DEPTH: &str = "depth";
 /// A list of a million frames has fewer bytes.
 const MAX_LIST: u64 = 64 << 20;
+
+/// Whether a folder has the name of one of KITTI's cameras.
+fn is_kitti_camera(name: &OsStr) -> bool {
+    ["image_00", "image_01", "image_02", "image_03"].iter().any(|known| name == *known)
+}
 
 /// How a folder is opened.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -105,6 +111,11 @@ impl Frames {
         let pictures = Pictures::new(height, width, options.cache_bytes)?;
         let mut found = Frames { sequences: Vec::new(), samples: Vec::new(), unreadable: Vec::new(), pictures };
         for (path, frames) in folders {
+            if path.ends_with("data") && path.parent().is_some_and(|p| p.file_name().is_some_and(is_kitti_camera)) {
+                let message = "is a camera of KITTI raw, in a drive that does not lie at DATE/DRIVE below the folder that was \
+                               given: give the folder that holds the dates";
+                return Err(Error::file(path, message));
+            }
             found.add(root, path, frames, options)?;
         }
         if let Some(list) = list {
@@ -372,5 +383,8 @@ mod tests {
         let skipping = open(bad.path(), None, Options { skip_bad_frames: true, ..PLAIN }).unwrap();
         assert_eq!((names(&skipping), skipping.unreadable().len()), (vec![". 4".into(), ". 5".into()], 1));
         assert!(message(open(&bad.path().join("nowhere"), None, PLAIN)).contains("nowhere"));
+        let deep = folder(&["kitti/day/drive/image_02/data/1.png"]);
+        let error = message(open(deep.path(), None, PLAIN));
+        assert!(error.contains("image_02/data") && error.contains("holds the dates"), "{error}");
     }
 }

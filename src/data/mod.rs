@@ -5,6 +5,7 @@ pub mod augment;
 pub mod batch;
 mod cache;
 pub mod camera;
+pub mod check;
 pub mod frames;
 pub mod inputs;
 
@@ -13,13 +14,14 @@ pub mod pyramid;
 pub mod resize;
 mod street;
 
+use std::path::Path;
 use std::sync::Arc;
 
 use image::RgbImage;
 
-use crate::Result;
 use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
+use crate::{Error, Result};
 
 /// Where a sample lies in time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -72,6 +74,35 @@ pub trait DataSource: Send + Sync {
 
     /// Ground-truth depth of the target frame at its own size, where there is one.
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>>;
+}
+
+/// Opens a folder to train on: KITTI raw by its layout ([`kitti`]), or any folder of frames ([`frames`]). Of the samples,
+/// all with both neighbours, those that a list names, or all; pictures come out at `[height, width]` pixels.
+///
+/// # Errors
+/// As [`Kitti::open`](kitti::Kitti::open) and [`Frames::open`](frames::Frames::open).
+pub fn open_folder(
+    root: &Path,
+    list: Option<&Path>,
+    size: [usize; 2],
+    camera: camera::Camera,
+    skip_bad_frames: bool,
+) -> Result<Arc<dyn DataSource>> {
+    if root.is_file() {
+        let message = "is a file: make a folder of frames of a film, for example with ffmpeg -i FILM -qscale:v 2 -vf \
+                       fps=10 FRAMES/%06d.jpg";
+        return Err(Error::file(root, message));
+    }
+    if !root.is_dir() {
+        let message = "expected a folder of frames, or one in the layout of KITTI raw; check the path";
+        return Err(Error::file(root, message));
+    }
+    if kitti::is_kitti(root)? {
+        let options = kitti::Options { camera, skip_bad_frames, ..kitti::Options::default() };
+        return Ok(Arc::new(kitti::Kitti::open(root, list, size[0], size[1], options)?));
+    }
+    let options = frames::Options { camera, skip_bad_frames, ..frames::Options::default() };
+    Ok(Arc::new(frames::Frames::open(root, list, size, options)?))
 }
 
 /// Some samples of a data set.

@@ -7,9 +7,7 @@ use std::sync::Arc;
 use super::recipe::RunConfig;
 use super::run::RunData;
 use crate::data::aside::set_aside;
-use crate::data::frames::{self, Frames};
-use crate::data::kitti::{self, Kitti, is_kitti};
-use crate::data::{DataSource, Subset};
+use crate::data::{DataSource, Subset, open_folder};
 use crate::error::{Error, Result};
 use crate::street::{Street, StreetConfig};
 
@@ -59,22 +57,10 @@ fn street(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + S
     }
 }
 
-/// The samples of a folder that a list names, or all: KITTI raw by its layout, or any folder of frames.
+/// The samples of the run's folder that a list names, or all.
 fn samples(config: &RunConfig, list: Option<&Path>) -> Result<Arc<dyn DataSource>> {
-    let (root, size) = (Path::new(&config.data), [config.height, config.width]);
-    let RunConfig { camera, skip_bad_frames, .. } = *config;
-    if !root.is_dir() {
-        return Err(Error::file(
-            root,
-            "expected a folder of frames, or one in the layout of KITTI raw; check the path",
-        ));
-    }
-    if is_kitti(root)? {
-        let options = kitti::Options { camera, skip_bad_frames, ..kitti::Options::default() };
-        return Ok(Arc::new(Kitti::open(root, list, size[0], size[1], options)?));
-    }
-    let options = frames::Options { camera, skip_bad_frames, ..frames::Options::default() };
-    Ok(Arc::new(Frames::open(root, list, size, options)?))
+    let size = [config.height, config.width];
+    open_folder(Path::new(&config.data), list, size, config.camera, config.skip_bad_frames)
 }
 
 fn folder(config: &RunConfig) -> Result<RunData> {
