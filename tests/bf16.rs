@@ -56,7 +56,8 @@ fn every_product_is_as_near_as_eight_bits_allow() {
     let mut draws =
         |shapes: &[&[usize]]| -> Vec<Tensor<f32>> { shapes.iter().map(|s| draw(&mut random, *s)).collect() };
     let same = Conv2d::padded(1);
-    let convolutions: [(&str, Conv2d, &[usize], &[usize], bool); 7] = [
+    type Case<'a> = (&'a str, Conv2d, &'a [usize], &'a [usize], bool);
+    let convolutions: [Case; 7] = [
         ("3x3", same, &[2, 7, 19, 16], &[3, 3, 16, 40], true),
         ("3x3, mirrored", same.reflecting(), &[1, 6, 21, 8], &[3, 3, 8, 17], true),
         ("1x1", Conv2d::default(), &[2, 5, 23, 34], &[1, 1, 34, 50], true),

@@ -54,6 +54,13 @@ impl<K: Eq + Hash> Pictures<K> {
         Ok(picture)
     }
 
+    /// How many pictures are kept, and their bytes.
+    #[cfg(test)]
+    pub(super) fn held(&self) -> (usize, usize) {
+        let kept = self.kept();
+        (kept.pictures.len(), kept.bytes)
+    }
+
     /// A thread that panicked with the lock held leaves whole entries behind: they can be used.
     fn kept(&self) -> MutexGuard<'_, Kept<K>> {
         self.kept.lock().unwrap_or_else(PoisonError::into_inner)

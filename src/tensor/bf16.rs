@@ -82,8 +82,9 @@ pub(super) use x86::{available, product};
 #[cfg(target_arch = "x86_64")]
 mod x86 {
     use std::arch::is_x86_feature_detected;
-    use std::arch::x86_64::_mm512_dpbf16_ps;
+    use std::arch::x86_64::{__m512, __m512bh, _mm512_dpbf16_ps};
     use std::cell::RefCell;
+    use std::mem::transmute;
     use std::sync::LazyLock;
 
     use super::super::gemm::Accum;
@@ -126,8 +127,8 @@ mod x86 {
     fn dot(sums: Floats, a: Pairs, b: Pairs) -> Floats {
         // SAFETY: all are 64 bytes, of which any bits are a value.
         unsafe {
-            use std::mem::transmute as of;
-            of(_mm512_dpbf16_ps(of::<Floats, _>(sums), of::<Pairs, _>(a), of::<Pairs, _>(b)))
+            let [a, b] = [a, b].map(|pairs| transmute::<Pairs, __m512bh>(pairs));
+            transmute::<__m512, Floats>(_mm512_dpbf16_ps(transmute::<Floats, __m512>(sums), a, b))
         }
     }
 

@@ -64,13 +64,15 @@ fn every_op_passes_every_check_and_no_changed_gradient_does() {
     assert!(failures.is_empty(), "{} failures:\n{}", failures.len(), failures.join("\n"));
 }
 
-/// Other inputs, other cotangents: what is right must not depend on the draw. `PARALLAX_SEEDS` asks for more of them.
+/// Other inputs, other cotangents: what is right must not depend on the draw. Every fourth case once; `PARALLAX_SEEDS`
+/// asks for so many draws of all.
 #[test]
 fn no_seed_raises_a_false_alarm() {
-    let count = std::env::var("PARALLAX_SEEDS").ok().and_then(|n| n.parse().ok()).unwrap_or(1);
+    let asked = std::env::var("PARALLAX_SEEDS").ok().and_then(|n| n.parse().ok());
+    let (count, step) = asked.map_or((1, 4), |count| (count, 1));
     let mut failures = Vec::new();
     for seed in 100..100 + count {
-        for case in registry::all().iter().flat_map(|e| e.cases()) {
+        for case in registry::all().iter().flat_map(|e| e.cases()).step_by(step) {
             let found = check_case(case.as_ref(), seed);
             if let Some(why) = found.report.failure() {
                 failures.push(format!("seed {seed}, {} [{}] \"{}\": {why}", found.op, found.algo, found.case));

@@ -556,3 +556,6 @@ impl DataSource for Kitti {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -90,8 +90,7 @@ fn the_cache_keeps_what_its_cap_allows() {
     for offset in [-1, 0, 1] {
         kitti.image(0, offset).unwrap();
     }
-    let held = |cache: &Cache| (cache.pictures.len(), cache.bytes);
-    assert_eq!(held(&kitti.cache()), (2, 2 * frame));
+    assert_eq!(kitti.pictures.held(), (2, 2 * frame));
     assert!(Arc::ptr_eq(&kitti.image(0, 0).unwrap(), &kitti.image(1, -1).unwrap()));
     assert!(!Arc::ptr_eq(&kitti.image(0, 1).unwrap(), &kitti.image(0, 1).unwrap()));
 }
