@@ -9,7 +9,7 @@ use crate::ops::registry::AnyCase;
 use crate::random::{Random, Stream};
 use crate::tensor::{Tensor, Var};
 
-/// What the check of one case found.
+/// Result of the comparison of one case's gradients with finite differences.
 #[derive(Clone, Debug, Serialize)]
 pub struct CaseReport {
     /// The op.
@@ -34,7 +34,7 @@ pub fn draw(case: &dyn AnyCase, seed: u64) -> Vec<Tensor<f64>> {
     case.inputs().iter().map(|input| input.draw(&mut random)).collect()
 }
 
-/// What a case says of its own check.
+/// Options for checking a case: its tolerance, kinks, constant inputs and names.
 pub fn options_of(case: &dyn AnyCase, seed: u64) -> Options {
     let numbers = |f: &dyn Fn(&crate::ops::Input) -> bool| {
         case.inputs().iter().enumerate().filter(|(_, input)| f(input)).map(|(i, _)| i).collect()

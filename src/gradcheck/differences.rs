@@ -12,7 +12,7 @@ use super::options::{Options, Stencil};
 use crate::random::{Random, Stream};
 use crate::tensor::{Tensor, Var};
 
-/// The quotients along one movement of the inputs, met with the cotangents.
+/// Difference quotients of `<cotangents, f>` along one direction: central, one-sided, and how far they may be off.
 #[derive(Clone, Copy, Debug)]
 pub struct Quotient {
     /// From both sides, extrapolated to a step of zero.
@@ -92,7 +92,7 @@ fn extrapolate(steps: &[Step]) -> [f64; 2] {
     [row[0], if n > 2 { short.max(1e-2 * (row[0] - before[0]).abs()) } else { short }]
 }
 
-/// How one input was moved, and what came of it.
+/// Difference quotients of one input, element by element or along random directions.
 #[derive(Clone, Debug)]
 pub struct Differences {
     /// The directions: element `k` alone is direction `k`, without.
@@ -130,7 +130,7 @@ pub struct Tie {
     pub bounds: Vec<[f64; 2]>,
 }
 
-/// The whole numeric side.
+/// Finite differences of all inputs, and what they tell of kinks and ties.
 #[derive(Clone, Debug)]
 pub struct Measured {
     /// For every input that is differentiated.

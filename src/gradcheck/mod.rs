@@ -217,7 +217,7 @@ fn differs(a: &Tensor<f64>, b: &Tensor<f64>, allowed: f64) -> bool {
     !a.same_bits(b) && (allowed == 0.0 || a.data().iter().zip(b.data()).any(apart))
 }
 
-/// The analytic side: what the backward pass says.
+/// Analytic gradients, by the backward pass, and the cotangents that they are for.
 #[derive(Clone, Debug)]
 pub struct Gradients {
     /// The cotangent of every tracked output.

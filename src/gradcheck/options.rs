@@ -2,7 +2,7 @@
 
 use crate::tensor::Tensor;
 
-/// How a gradient is checked. The default suits any smooth function of numbers of magnitude one.
+/// Settings of a gradient check: step, stencil, tolerance, kinks. The default suits any smooth function of numbers of magnitude one.
 #[derive(Clone, Debug)]
 pub struct Options {
     /// The step of the differences is this times max(1, |x|).
@@ -75,7 +75,7 @@ impl Options {
     }
 }
 
-/// How many points a difference takes.
+/// Stencil of a finite difference.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stencil {
     /// (f(x + h) - f(x - h)) / 2h: exact up to h^2.
@@ -84,7 +84,7 @@ pub enum Stencil {
     FivePoint,
 }
 
-/// How far analytic and numeric derivatives may be apart.
+/// Tolerance between analytic and numeric derivatives.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Tolerance {
     /// |analytic - numeric| <= this, times the largest analytic derivative of the input.
@@ -109,7 +109,7 @@ impl Tolerance {
     }
 }
 
-/// What to make of elements where the one-sided differences disagree. They are listed in the report in any case, and
+/// Treatment of kinks: elements where the one-sided differences disagree. They are listed in the report in any case, and
 /// an analytic value that does not lie between the one-sided ones fails in any case.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kinks {
@@ -119,7 +119,7 @@ pub enum Kinks {
     Any,
 }
 
-/// What the outputs' differences and the backward pass are met with.
+/// Cotangents (the vectors of the vector-Jacobian products) of a check.
 #[derive(Clone, Debug)]
 pub enum Cotangents {
     /// Random numbers of magnitude 0.5 to 1.5 and either sign: one backward pass, and nothing cancels.

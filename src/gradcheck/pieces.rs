@@ -16,7 +16,7 @@ const THREADS: [usize; 3] = [2, 3, 8];
 /// Largest error of an f32 output or gradient, of the largest number in it.
 const SINGLE: f64 = 1e-4;
 
-/// What was found with pieces of one size.
+/// Result of a case's checks with pieces of one size.
 pub struct Found {
     /// The cuts that the op made, forward and backward.
     pub cuts: Vec<Cut>,
@@ -24,7 +24,7 @@ pub struct Found {
     pub complaints: Vec<(&'static str, String)>,
 }
 
-/// A case, with what it gives when nothing is cut.
+/// A case to be checked with small pieces of work: its reference values, computed with pieces of the usual sizes.
 pub struct Pieces<'a> {
     subject: &'a Subject<'a>,
     seeds: Vec<Option<Tensor<f64>>>,
@@ -56,7 +56,7 @@ impl Drop for Small {
 }
 
 impl<'a> Pieces<'a> {
-    /// What everything is compared with: computed here, with pieces of the usual sizes.
+    /// Computes the reference values.
     pub fn new(subject: &'a Subject<'a>) -> Self {
         let seeds = subject.gradients().cotangents;
         let usual = outcome(&|vars| subject.case.run(vars), &subject.inputs, &subject.all, &|_| seeds.clone(), None);
@@ -146,7 +146,7 @@ impl<'a> Pieces<'a> {
     }
 }
 
-/// What is known of one cut: how often it was made, the most pieces, and whether a last piece was seen that is shorter,
+/// Statistics of one cut: how often it was made, the most pieces, and whether a last piece was seen that is shorter,
 /// and one that is not.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Crossed {

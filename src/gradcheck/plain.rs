@@ -4,7 +4,7 @@ use super::function::Function;
 use super::{Options, Report, check_function};
 use crate::tensor::Tensor;
 
-/// What a plain function may return: a number, or several.
+/// Return value of a plain function: one number, or several.
 pub trait Numbers {
     /// All of them.
     fn numbers(self) -> Vec<f64>;

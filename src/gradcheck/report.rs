@@ -8,7 +8,7 @@ use super::Gradients;
 use super::differences::{Differences, Measured, Tie};
 use super::options::{Kinks, Options};
 
-/// What the check of one input found.
+/// Comparison of one input's analytic and numeric derivatives.
 #[derive(Clone, Debug, Serialize)]
 pub struct InputReport {
     /// Its name, or its number.
@@ -137,7 +137,7 @@ impl InputReport {
 
 /// Analytic and numeric derivatives may be apart by so many times what the differences say that they may be off.
 const ROOM: f64 = 4.0;
-/// What a check found.
+/// Result of a gradient check, with what is wrong and what is worth a warning.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
     /// For each input; `None` for constants.
@@ -195,7 +195,7 @@ impl Report {
         self.inputs.iter().flatten().map(|i| i.kinks.len()).sum()
     }
 
-    /// What is wrong, in a sentence; `None` if nothing is.
+    /// Failure in a sentence; `None` if the gradients are right.
     pub fn failure(&self) -> Option<&str> {
         self.failure.as_deref()
     }

@@ -5,7 +5,7 @@ use super::function::{Function, OfVars};
 use crate::random::{Random, Stream};
 use crate::tensor::{Tensor, Var};
 
-/// A Hessian times a direction.
+/// Hessian-vector product, by differences of gradients.
 #[derive(Clone, Debug)]
 pub struct Hvp {
     /// For every input; `None` for constants.

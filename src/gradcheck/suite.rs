@@ -17,7 +17,7 @@ use crate::tensor::{Tape, Tensor, Var, parallel, pool};
 /// What a case gives in f64.
 type Outcome = super::outcome::Outcome<f64>;
 
-/// A case with its inputs, and what is known of it so far.
+/// A case under check: inputs, options, and what was computed of it so far.
 pub struct Subject<'a> {
     /// The case.
     pub case: &'a dyn AnyCase,
@@ -57,7 +57,7 @@ impl<'a> Subject<'a> {
         Subject { case, inputs, options, all, seed: self.seed, measured, first: OnceCell::new() }
     }
 
-    /// What it is called in messages.
+    /// Name in messages: op, kernel path, case.
     pub fn what(&self) -> String {
         format!("{} [{}] \"{}\"", self.case.op(), self.case.algo(), self.case.name())
     }
@@ -66,7 +66,7 @@ impl<'a> Subject<'a> {
         self.case.run(&vars.iter().collect::<Vec<_>>())
     }
 
-    /// The op's outputs and gradients, the first time.
+    /// Outputs and gradients of the op, computed once.
     pub fn first(&self) -> &Outcome {
         self.first.get_or_init(|| self.outcome(&self.inputs, &self.all))
     }
@@ -76,7 +76,7 @@ impl<'a> Subject<'a> {
         outcome(&run, inputs, tracked, &|outputs| cotangents(outputs, self.seed), None)
     }
 
-    /// The finite differences.
+    /// Finite differences, computed once.
     pub fn measured(&self) -> &Measured {
         self.measured.get_or_init(|| {
             let tracked: Vec<usize> = (0..self.inputs.len()).filter(|&i| self.all[i]).collect();
@@ -86,7 +86,7 @@ impl<'a> Subject<'a> {
         })
     }
 
-    /// The gradients as the checker takes them.
+    /// Analytic gradients in the form that [`Report::new`] takes.
     pub fn gradients(&self) -> Gradients {
         let vars = leaves(&Tape::new(), &self.inputs, &self.all);
         let cotangents = cotangents(&self.run(&vars), self.seed);
@@ -96,16 +96,16 @@ impl<'a> Subject<'a> {
         Gradients { cotangents, inputs: self.first().1.iter().enumerate().map(zero).collect() }
     }
 
-    /// The comparison of gradients and differences.
+    /// Comparison of analytic gradients and finite differences.
     pub fn report(&self) -> Report {
         Report::new(&self.gradients(), self.measured(), &self.options)
     }
 }
 
-/// A check: what is wrong, if anything is.
+/// A check of a case: `Err` says what is wrong.
 pub type Check = fn(&Subject) -> Result<(), String>;
 
-/// All of them.
+/// The checks that every case must pass, by name.
 pub const CHECKS: [(&str, Check); 10] = [
     ("differences", against_differences),
     ("promises", keeps_its_promise),
@@ -290,7 +290,7 @@ fn close(single: &Tensor<f32>, double: &Tensor<f64>) -> Result<(), String> {
     Ok(())
 }
 
-/// What an op did wrong, in one check of one case.
+/// Failure of one check on one case.
 #[derive(Clone, Debug, Serialize)]
 pub struct Complaint {
     /// The case.
@@ -303,7 +303,7 @@ pub struct Complaint {
     pub why: String,
 }
 
-/// What all checks of one case found.
+/// Result of all checks of one case.
 pub struct Verdict {
     /// The comparison with finite differences.
     pub report: Report,
@@ -338,7 +338,7 @@ pub fn check_everything(subject: &Subject) -> Verdict {
     Verdict { report: subject.report(), cuts, sizes, complaints }
 }
 
-/// What [`check_op`] found.
+/// Result of [`check_op`].
 #[derive(Clone, Debug, Serialize)]
 pub struct OpReport {
     /// The op.

@@ -3,7 +3,7 @@
 use super::StreetConfig;
 use super::draw::Draw;
 
-/// Where a camera is: camera-to-world, in metres; x right, y down, z forward in both frames.
+/// Camera pose: camera-to-world, in metres; x right, y down, z forward in both frames.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pose {
     /// Rotation from the camera's axes to the world's, row-major; its columns are the camera's axes in the world.
@@ -13,7 +13,7 @@ pub struct Pose {
 }
 
 impl Pose {
-    /// A camera at `position`, turned right by `yaw` and then up by `pitch` (radians).
+    /// Pose of a camera at `position`, turned right by `yaw` and then up by `pitch` (radians).
     pub fn new(position: [f64; 3], yaw: f64, pitch: f64) -> Self {
         let (sy, cy) = (libm::sin(yaw), libm::cos(yaw));
         let (sp, cp) = (libm::sin(pitch), libm::cos(pitch));

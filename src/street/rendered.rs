@@ -15,7 +15,7 @@ use super::world::World;
 use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
 
-/// What to render.
+/// Settings of the rendered street: size, number of sequences and frames, seed, camera.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct StreetConfig {
@@ -90,7 +90,7 @@ impl Street {
         Street { config: config.clone(), sequences: (0..config.sequences).into_par_iter().map(sequence).collect() }
     }
 
-    /// What was rendered.
+    /// Settings with which it was rendered.
     pub fn config(&self) -> &StreetConfig {
         &self.config
     }

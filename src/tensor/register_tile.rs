@@ -12,7 +12,7 @@ use pulp::{Simd, WithSimd};
 use super::gemm::Accum;
 use super::pool::Buffer;
 use super::simd::copy_run;
-use super::{Float, Precision, Signature, bf16, parallel, simd};
+use super::{Float, Precision, Signature, bf16, parallel, regime, simd};
 
 /// Vectors side by side in a tile of the result.
 const VECTORS: usize = 2;
@@ -49,7 +49,7 @@ impl<'a, T: Float> Panels<'a, T> {
         if precision == Precision::Bf16 && size_of::<T>() == size_of::<f32>() {
             return Self::pairs(matrix, rows, cols);
         }
-        if uses < MANY && cols.is_multiple_of(lanes) {
+        if uses < regime::size(MANY) && cols.is_multiple_of(lanes) {
             return Panels { data: Data::Dense(&matrix[..rows * cols]), rows, cols, lanes };
         }
         Self::pack(rows, cols, |first, width, step, panel| {

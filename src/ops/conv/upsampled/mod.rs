@@ -310,9 +310,9 @@ impl Checked for UpsampledConv2d {
         ];
         for activation in Activation::fused() {
             let op = UpsampledConv2d { activation, ..plain };
-            cases.push(case("3x3, activated", op, [1, 2, 2, 2], &[], [3, 3], true));
+            cases.push(case("3x3, activated", op, [2, 2, 2, 1], &[], [3, 33], true));
             cases.push(case("3x3 beside another, activated", op, [1, 2, 3, 1], &[2], [3, 3], true));
-            cases.push(case("1x1, activated", op, [2, 1, 2, 2], &[3], [1, 3], true));
+            cases.push(case("1x1, activated", op, [2, 1, 2, 2], &[3], [1, 33], true));
         }
         cases
     }
