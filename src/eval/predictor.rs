@@ -59,8 +59,8 @@ impl Predictor {
         Predictor { model: model.clone(), params: Folded::new(params), setup: *setup }
     }
 
-    /// The same, with products of convolutions and linear layers in other numbers. In bf16 depths move by some 0.3 % on
-    /// average and by 1 % in one pixel of a hundred; the time is 0.7 of f32's for the small network.
+    /// The same, with products of convolutions and linear layers in other numbers. In bf16 depths move by some 0.05 % on
+    /// average, and by 0.2 % in one pixel of a hundred (`PERFORMANCE.md`).
     ///
     /// # Errors
     /// If this machine has not the instruction: see [`Precision::is_available`].

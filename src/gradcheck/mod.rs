@@ -89,6 +89,20 @@
 //! check_fn(f, &numbers, &Options::single());
 //! ```
 //!
+//! # How small an error it notices
+//!
+//! Twelve functions at eight points, with a gradient that is off as a whole, or in one number by so much of the largest;
+//! in percent noticed, each checker with its defaults (`benches/pytorch/detection.py`; PyTorch 2.15, JAX 0.10, in f64):
+//!
+//! | off by | 1e-7 | 3e-7 | 1e-6 | 1e-5 | 1e-4 | 1e-3 | 3e-3 | right |
+//! |---|---|---|---|---|---|---|---|---|
+//! | [`check`], all | 0 | 100 | 100 | 100 | 100 | 100 | 100 | 0 |
+//! | `torch.autograd.gradcheck`, all | 0 | 0 | 0 | 0 | 0 | 0 | 100 | 0 |
+//! | `jax.test_util.check_grads`, all | 0 | 0 | 0 | 1 | 97 | 100 | 100 | 0 |
+//! | [`check`], one | 0 | 100 | 100 | 100 | 100 | 100 | 100 | 0 |
+//! | `torch.autograd.gradcheck`, one | 0 | 0 | 0 | 43 | 100 | 100 | 100 | 0 |
+//! | `jax.test_util.check_grads`, one | 0 | 0 | 0 | 21 | 100 | 100 | 100 | 0 |
+//!
 //! # What is not there
 //!
 //! Derivatives in forward mode, complex numbers, sparse tensors, and second derivatives by a backward pass through the

@@ -356,7 +356,7 @@ impl Checked for Conv2d {
             let paths = [
                 // Of 33 outputs: two panels of registers.
                 ("activated", same, [2, 4, 5, 1], [3, 3, 1, 33]),
-                ("activated, reflected", same.reflecting(), [2, 3, 5, 1], [3, 3, 1, 33]),
+                ("activated, reflected", same.reflecting(), [2, 3, 5, 2], [3, 3, 2, 33]),
                 ("activated, stride 2", same.strided(2), [2, 5, 6, 2], [3, 3, 2, 3]),
                 ("activated, 1x1", Conv2d::default(), [2, 3, 4, 2], [1, 1, 2, 33]),
                 ("activated, groups", Conv2d { groups: 2, ..same }, [2, 3, 4, 4], [3, 3, 2, 6]),
