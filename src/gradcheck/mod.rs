@@ -118,6 +118,7 @@ mod pieces;
 mod plain;
 mod report;
 mod second;
+mod single;
 mod suite;
 mod taylor;
 #[cfg(test)]

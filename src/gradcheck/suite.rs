@@ -7,6 +7,7 @@ use std::sync::{Mutex, PoisonError};
 use serde::Serialize;
 
 use super::outcome::{leaves, outcome, same};
+use super::single::all_the_same_in_f32;
 use super::{Gradients, Kinks, Measured, Options, Pieces, Report, SIZES, cotangents, differences, draw, options_of};
 use crate::ops::Op;
 use crate::ops::case::Fill;
@@ -55,6 +56,11 @@ impl<'a> Subject<'a> {
         let measured = OnceCell::from(self.measured().clone());
         let (inputs, options, all) = (self.inputs.clone(), self.options.clone(), self.all.clone());
         Subject { case, inputs, options, all, seed: self.seed, measured, first: OnceCell::new() }
+    }
+
+    /// The seed of its inputs and cotangents.
+    pub(super) fn seed(&self) -> u64 {
+        self.seed
     }
 
     /// Name in messages: op, kernel path, case.
@@ -106,7 +112,7 @@ impl<'a> Subject<'a> {
 pub type Check = fn(&Subject) -> Result<(), String>;
 
 /// The checks that every case must pass, by name.
-pub const CHECKS: [(&str, Check); 10] = [
+pub const CHECKS: [(&str, Check); 11] = [
     ("differences", against_differences),
     ("promises", keeps_its_promise),
     ("accumulation", adds_to_what_is_there),
@@ -117,6 +123,7 @@ pub const CHECKS: [(&str, Check); 10] = [
     ("poison", is_the_same_over_poisoned_memory),
     ("zeros", is_the_same_over_poisoned_memory_at_zeros),
     ("single", is_nearly_the_same_in_single_precision),
+    ("f32", all_the_same_in_f32),
 ];
 
 /// Analytic gradients against finite differences; at kinks between the one-sided ones, at ties in sum.
@@ -220,14 +227,13 @@ fn is_the_same_on_one_and_two_threads(s: &Subject) -> Result<(), String> {
     Ok(())
 }
 
-/// Buffers full of NaN instead of what was left in them: whoever reads before writing is found. The switch is one for
-/// the whole process; those who come here take turns.
+/// Buffers full of NaN instead of what was left in them: whoever reads before writing is found.
 fn is_the_same_over_poisoned_memory(s: &Subject) -> Result<(), String> {
-    same(s.first(), &poisoned(s, &s.inputs))
+    same(s.first(), &poisoned(|| s.outcome(&s.inputs, &s.all)))
 }
 
-/// The outcome over buffers full of NaN.
-fn poisoned(s: &Subject, inputs: &[Tensor<f64>]) -> Outcome {
+/// Runs something over buffers full of NaN. The switch is one for the whole process: those who come here take turns.
+pub(super) fn poisoned<R>(run: impl FnOnce() -> R) -> R {
     static TURN: Mutex<()> = Mutex::new(());
     /// Turns the poison off, also where the op panics.
     struct Clean;
@@ -239,7 +245,7 @@ fn poisoned(s: &Subject, inputs: &[Tensor<f64>]) -> Outcome {
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
     let _clean = Clean;
     pool::set_poison(true);
-    s.outcome(inputs, &s.all)
+    run()
 }
 
 /// The same where numbers are exactly zero: loops that skip zeros leave what they should have written.
@@ -251,7 +257,7 @@ fn is_the_same_over_poisoned_memory_at_zeros(s: &Subject) -> Result<(), String> 
         }
     }
     let clean = || s.outcome(&inputs, &s.all);
-    let (once, again, over_nan) = (clean(), clean(), poisoned(s, &inputs));
+    let (once, again, over_nan) = (clean(), clean(), poisoned(clean));
     same(&once, &again).and_then(|()| same(&once, &over_nan)).map_err(|why| format!("{why} where inputs are zero"))
 }
 
