@@ -234,7 +234,11 @@ fn every_planted_bug_is_noticed() {
         for (case, real) in planted(mutant).into_iter().zip(known) {
             let subject = real.altered(&case);
             for (noticed, (_, check)) in noticed.iter_mut().zip(CHECKS) {
-                *noticed = *noticed || check(&subject).is_err();
+                *noticed = check(&subject).is_err();
+            }
+            // All checks of the first case that shows it.
+            if noticed.contains(&true) {
+                break;
             }
         }
         let by: Vec<&str> = columns.iter().zip(&noticed).filter(|(_, n)| **n).map(|(c, _)| *c).collect();
