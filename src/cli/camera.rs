@@ -26,7 +26,7 @@ pub enum NamedCamera {
 }
 
 impl CameraArgs {
-    /// What the flags say, or what was said otherwise.
+    /// The camera that the flags name, or `otherwise`.
     pub fn or(&self, otherwise: Camera) -> Camera {
         match (self.intrinsics, self.fov, self.camera) {
             (Some([fx, fy, cx, cy]), ..) => Camera::Pixels { fx, fy, cx, cy },

@@ -26,7 +26,8 @@ enum What {
     Street(StreetArgs),
     /// Look at a folder before training on it: what it holds, what is wrong with it, what training would take.
     ///
-    /// Exit status 1 if one cannot train on it.
+    /// Exit status 1 if there is nothing to train on. Frames that cannot be read are counted and named; train refuses them
+    /// without --skip-bad-frames.
     Check(CheckArgs),
 }
 

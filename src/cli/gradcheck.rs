@@ -45,13 +45,13 @@ struct Row {
 #[derive(Serialize)]
 struct Table {
     ops: Vec<Row>,
-    /// What was done with each case.
+    /// Names of the checks of each case.
     checks: Vec<&'static str>,
     /// Cases that were drawn at random.
     drawn: usize,
     /// Places in the source at which work was cut.
     places: usize,
-    /// What is wrong, check by check.
+    /// Failed checks.
     complaints: Vec<Wrong>,
 }
 

@@ -1,4 +1,4 @@
-//! What is worth knowing of a data set before a network is trained on it.
+//! Inspection of a data set before training: still stretches, exposure jumps, cuts, unreadable frames.
 
 use std::collections::BTreeMap;
 
@@ -18,7 +18,7 @@ const CUT: f64 = 50.0;
 /// Of what share of still pairs on a recording is said to stand still.
 const MANY: f64 = 0.3;
 
-/// What was found in one recording.
+/// Statistics of one recording.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Recording {
     /// The name of its first sample.
@@ -35,7 +35,7 @@ pub struct Recording {
     pub with_depth: usize,
 }
 
-/// What was found in a data set.
+/// Result of the inspection of a data set.
 #[derive(Clone, Debug, Serialize)]
 pub struct Findings {
     /// One by one.
@@ -51,7 +51,7 @@ pub struct Findings {
 }
 
 impl Findings {
-    /// What should be looked at before training, in words; nothing if nothing was found.
+    /// Advice in words, one sentence for each fault; empty if there is none.
     pub fn advice(&self) -> Vec<String> {
         let mut advice = Vec::new();
         if let Some((name, why)) = self.unreadable.first() {

@@ -59,7 +59,7 @@ impl Predictor {
         Predictor { model: model.clone(), params: Folded::new(params), setup: *setup }
     }
 
-    /// The same, with products of convolutions and linear layers in other numbers. In bf16 depths move by some 0.05 % on
+    /// This predictor with products of convolutions and linear layers in other numbers. In bf16 depths move by some 0.05 % on
     /// average, and by 0.2 % in one pixel of a hundred (`PERFORMANCE.md`).
     ///
     /// # Errors

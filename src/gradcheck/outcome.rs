@@ -1,4 +1,4 @@
-//! What an op gives, forward and backward, in either element type; and how far two such outcomes are apart.
+//! Outputs and gradients of an op, in either element type; and how far two such outcomes are apart.
 
 use crate::tensor::{Float, Tape, Tensor, Var};
 

@@ -1,4 +1,4 @@
-//! The same checks with all pieces of work made small: the second chunk, the third tile, the last block that is shorter
+//! Checks with all pieces of work made small: the second chunk, the third tile, the last block that is shorter
 //! are compared with finite differences like the first ones. In f64 and f32, on several threads.
 
 use std::collections::BTreeMap;
@@ -20,7 +20,7 @@ const SINGLE: f64 = 1e-4;
 pub struct Found {
     /// The cuts that the op made, forward and backward.
     pub cuts: Vec<Cut>,
-    /// What is wrong: the check, and why.
+    /// Failed checks: name, and why.
     pub complaints: Vec<(&'static str, String)>,
 }
 
@@ -33,7 +33,7 @@ pub struct Pieces<'a> {
     before: Vec<Tensor<f64>>,
     inputs_f32: Vec<Tensor<f32>>,
     seeds_f32: Vec<Option<Tensor<f32>>>,
-    /// The same numbers in f64.
+    /// The numbers of `inputs_f32` in f64.
     widened: Vec<Tensor<f64>>,
 }
 
@@ -134,7 +134,7 @@ impl<'a> Pieces<'a> {
         Report::new(&gradients, self.subject.measured(), &self.subject.options)
     }
 
-    /// What the gradients have to be where there were others before.
+    /// Expected gradients where there were others before: the sums of both.
     fn sums(&self, found: &Outcome<f64>) -> Vec<Tensor<f64>> {
         let tracked = (0..self.before.len()).filter(|&i| self.subject.all[i]);
         let sum = |i: usize| {

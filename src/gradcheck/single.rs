@@ -1,4 +1,4 @@
-//! What training runs in: the checks that need no finite differences again in f32, whose loops and vectors are others.
+//! Checks in f32, in which training runs: all that need no finite differences.
 
 use super::cotangents;
 use super::outcome::{Outcome, distance, leaves, outcome, same};

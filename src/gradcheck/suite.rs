@@ -15,7 +15,7 @@ use crate::ops::registry::{AnyCase, Entry};
 use crate::tensor::regime::Cut;
 use crate::tensor::{Tape, Tensor, Var, parallel, pool};
 
-/// What a case gives in f64.
+/// Outputs and gradients of a case in f64.
 type Outcome = super::outcome::Outcome<f64>;
 
 /// A case under check: inputs, options, and what was computed of it so far.

@@ -36,7 +36,7 @@ impl<T: Float> Folded<T> {
         Folded { params: folded, precision: Precision::F32 }
     }
 
-    /// The same, with products of convolutions and linear layers in other numbers.
+    /// These parameters, with products of convolutions and linear layers in other numbers.
     ///
     /// # Panics
     /// If this machine has not the instruction for it: see [`Precision::is_available`].

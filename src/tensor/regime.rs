@@ -126,7 +126,7 @@ pub mod mutants {
             Bug::ShortensLast,
         ];
 
-        /// What it is called in tables.
+        /// Name in tables.
         pub fn name(self) -> &'static str {
             match self {
                 Bug::DropsLast => "drops the last",

@@ -116,7 +116,7 @@ pub trait Vector: Copy + 'static {
     /// is compiled for the baseline, where `mul_add` is a call into a library.
     fn dispatch<R>(kernel: impl FnOnce() -> R) -> R;
 
-    /// The same for a kernel that is written in these vectors.
+    /// [`dispatch`](Vector::dispatch) for a kernel that is written in these vectors.
     fn dispatch_vector<K: WithSimd>(kernel: K) -> K::Output;
 
     /// Elements in a vector.

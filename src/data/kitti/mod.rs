@@ -497,7 +497,7 @@ impl Kitti {
     }
 }
 
-/// What the calibration of a day says of a camera.
+/// Camera of a side, from the calibration of its day.
 fn calibrated(day: &Path, side: Side) -> Result<camera::Found> {
     let found = Calibration::intrinsics_of(day, side)?;
     Ok(camera::Found::measured(found, day.join(calibration::CAMERAS).display().to_string()))
