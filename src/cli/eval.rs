@@ -212,7 +212,9 @@ impl Args {
             let camera = Camera::Fov { degrees: 90.0 };
             let options = frames::Options { neighbours: false, with_depth: true, camera, ..frames::Options::default() };
             let frames = Frames::open(root, self.split.as_deref(), [height, width], options)?;
-            return Ok((Box::new(frames), LeftOut::default()));
+            // Every frame of a list has depth, or opening failed.
+            let left_out = if self.split.is_some() { LeftOut::default() } else { frames.left_out().clone() };
+            return Ok((Box::new(frames), left_out));
         }
         let ground_truth = match self.protocol {
             Protocol::Eigen => GroundTruth::Lidar(DepthAxis::LidarX),

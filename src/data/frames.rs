@@ -21,6 +21,7 @@ use image::RgbImage;
 use super::cache::Pictures;
 use super::camera::{self, Camera};
 use super::inputs::find_pictures;
+use super::kitti::LeftOut;
 use super::{DataSource, Place};
 use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
@@ -88,6 +89,7 @@ pub struct Frames {
     sequences: Vec<Sequence>,
     samples: Vec<Place>,
     unreadable: Vec<(String, String)>,
+    left_out: LeftOut,
     pictures: Pictures<Place>,
 }
 
@@ -109,7 +111,13 @@ impl Frames {
             }
         }
         let pictures = Pictures::new(height, width, options.cache_bytes)?;
-        let mut found = Frames { sequences: Vec::new(), samples: Vec::new(), unreadable: Vec::new(), pictures };
+        let mut found = Frames {
+            sequences: Vec::new(),
+            samples: Vec::new(),
+            unreadable: Vec::new(),
+            left_out: LeftOut::default(),
+            pictures,
+        };
         for (path, frames) in folders {
             if path.ends_with("data") && path.parent().is_some_and(|p| p.file_name().is_some_and(is_kitti_camera)) {
                 let message = "is a camera of KITTI raw, in a drive that does not lie at DATE/DRIVE below the folder that was \
@@ -168,7 +176,10 @@ impl Frames {
         let around = usize::from(options.neighbours);
         for frame in around..sequence.frames.len().saturating_sub(around) {
             let readable = whole[frame - around..=frame + around].iter().all(|&whole| whole);
-            if readable && (!options.with_depth || sequence.depth(frame).is_file()) {
+            if readable && options.with_depth && !sequence.depth(frame).is_file() {
+                self.left_out.without_depth += 1;
+                self.left_out.first_depth.get_or_insert_with(|| sequence.depth(frame));
+            } else if readable {
                 self.samples.push(Place { sequence: self.sequences.len(), frame });
             }
         }
@@ -201,6 +212,11 @@ impl Frames {
         }
         self.samples = kept;
         Ok(())
+    }
+
+    /// Frames that lack the depth map that was asked for.
+    pub fn left_out(&self) -> &LeftOut {
+        &self.left_out
     }
 
     /// Why there is no sample.
@@ -355,7 +371,10 @@ mod tests {
         assert_eq!(names(&frames), ["a 2", "a 3"]);
         assert_eq!((frames.depth(0).unwrap(), frames.depth(1).unwrap()), (Some(depth), None));
         let measured = Options { neighbours: false, with_depth: true, ..PLAIN };
-        assert_eq!(names(&open(root.path(), None, measured).unwrap()), ["a 2"]);
+        let measured = open(root.path(), None, measured).unwrap();
+        assert_eq!(names(&measured), ["a 2"]);
+        assert_eq!(measured.left_out().without_depth, 3);
+        assert!(measured.left_out().first_depth.as_ref().unwrap().ends_with("a/depth/1.png"));
     }
 
     #[test]
