@@ -2,7 +2,6 @@
 //! are compared with finite differences like the first ones. In f64 and f32, on several threads.
 
 use std::collections::BTreeMap;
-use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use super::outcome::{Outcome, distance, outcome, same};
 use super::{Gradients, Report, Subject};
@@ -37,24 +36,6 @@ pub struct Pieces<'a> {
     widened: Vec<Tensor<f64>>,
 }
 
-/// Makes pieces small for as long as it lives. The size is a switch of the whole process: those who want it take turns.
-struct Small(#[expect(dead_code, reason = "held, not read")] MutexGuard<'static, ()>);
-
-impl Small {
-    fn new(size: usize) -> Small {
-        static TURN: Mutex<()> = Mutex::new(());
-        let turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
-        regime::shrink(size);
-        Small(turn)
-    }
-}
-
-impl Drop for Small {
-    fn drop(&mut self) {
-        regime::shrink(0);
-    }
-}
-
 impl<'a> Pieces<'a> {
     /// Computes the reference values.
     pub fn new(subject: &'a Subject<'a>) -> Self {
@@ -79,6 +60,11 @@ impl<'a> Pieces<'a> {
     /// Checks the case with pieces of at most `size` units. Where nothing is cut at that size nothing is compared: it is
     /// what was computed at the usual sizes.
     pub fn check(&self, size: usize) -> Found {
+        regime::shrink(size, || self.check_here())
+    }
+
+    /// Checks the case with pieces of the size that is set.
+    fn check_here(&self) -> Found {
         let Subject { case, inputs, all, .. } = self.subject;
         let run = |vars: &[&Var<f64>]| case.run(vars);
         let run_f32 = |vars: &[&Var<f32>]| case.run_f32(vars);
@@ -86,7 +72,6 @@ impl<'a> Pieces<'a> {
         let single = || outcome(&run_f32, &self.inputs_f32, all, &|_| self.seeds_f32.clone(), None);
         let alone = |f: &dyn Fn() -> Outcome<f64>| parallel::with_threads(1, f);
 
-        let _small = Small::new(size);
         let (found, cuts) = regime::record(|| alone(&|| double(inputs, None)));
         if cuts.iter().all(|cut| cut.pieces < 2) {
             return Found { cuts, complaints: Vec::new() };

@@ -109,7 +109,9 @@ fn cut<T: Send>(
     if stays(data.len().div_ceil(chunk), work) {
         data.chunks_mut(chunk).enumerate().for_each(|(i, c)| f(i, c));
     } else {
-        in_pool(&mut || split(data, chunk, 0, f));
+        // Whoever computes a chunk cuts it further as the thread would that hands it over.
+        let largest = regime::largest();
+        in_pool(&mut || split(data, chunk, 0, &|i, c| regime::shrink(largest, || f(i, c))));
     }
 }
 

@@ -9,24 +9,35 @@
 use std::cell::{Cell, RefCell};
 use std::ops::Range;
 use std::panic::Location;
-use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-/// The largest size of a piece; none if 0.
-static LARGEST: AtomicUsize = AtomicUsize::new(0);
+thread_local! {
+    /// The largest size of a piece of work that this thread asked for; none if `usize::MAX`.
+    static LARGEST: Cell<usize> = const { Cell::new(usize::MAX) };
+}
 
 /// The size at which a kernel cuts its work, in its own unit: `usual`, unless a check has made it smaller.
 #[inline(always)]
 pub fn size(usual: usize) -> usize {
-    match LARGEST.load(Relaxed) {
-        0 => usual,
-        largest => usual.min(largest),
-    }
+    usual.min(largest())
 }
 
-/// Makes every piece of work in this process at most `largest` units; 0 for the usual sizes. For checks alone: sums are
-/// added in another order then, and so have other last bits.
-pub fn shrink(largest: usize) {
-    LARGEST.store(largest, Relaxed);
+/// The largest size of a piece on this thread.
+#[inline(always)]
+pub(super) fn largest() -> usize {
+    LARGEST.get()
+}
+
+/// Runs `f` with pieces of work of at most `largest` units: what this thread computes, and what it hands over to others.
+/// For checks alone: sums are added in another order then, and so have other last bits.
+pub fn shrink<R>(largest: usize, f: impl FnOnce() -> R) -> R {
+    struct Restore(usize);
+    impl Drop for Restore {
+        fn drop(&mut self) {
+            LARGEST.set(self.0);
+        }
+    }
+    let _restore = Restore(LARGEST.replace(largest.max(1)));
+    f()
 }
 
 /// One cut that a kernel made: whose kernel, its place in the source, and how many pieces there were.
@@ -221,7 +232,31 @@ pub fn blocks(range: Range<usize>, usual: usize) -> impl Iterator<Item = Range<u
 
 #[cfg(test)]
 mod tests {
+    use super::super::parallel;
     use super::*;
+
+    #[test]
+    fn a_size_is_the_callers_alone_on_whatever_threads_it_computes() {
+        let seen = |largest| {
+            shrink(largest, || {
+                parallel::with_threads(3, || {
+                    parallel::map(64, usize::MAX, |_| (size(100), parallel::map(9, 9, |_| size(7))))
+                })
+            })
+        };
+        std::thread::scope(|scope| {
+            for largest in [1, 2, 50, 3, 5] {
+                scope.spawn(move || {
+                    for (outer, inner) in (0..200).flat_map(|_| seen(largest)) {
+                        assert_eq!((outer, inner), (largest.min(100), vec![largest.min(7); 9]));
+                    }
+                    assert_eq!(size(100), 100, "restored");
+                });
+            }
+        });
+        let _ = std::panic::catch_unwind(|| shrink(2, || panic!("on purpose")));
+        assert_eq!(size(100), 100, "restored after a panic");
+    }
 
     #[test]
     fn blocks_cover_a_range_once_and_are_noted() {
