@@ -25,7 +25,7 @@ fn benches(c: &mut Criterion) {
     group.bench_function("inference", |b| {
         b.iter(|| {
             let c = Context::inference(&trainer.params);
-            black_box(trainer.model.disparities(&c, &Var::constant(batch.seen[1].clone())))
+            black_box(trainer.model.disparities(&c, &Var::constant(batch.target.clone())))
         });
     });
     group.bench_function("training step", |b| b.iter(|| black_box(trainer.step(&batch).expect("a finite loss"))));

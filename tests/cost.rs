@@ -15,12 +15,7 @@ fn triplets(height: usize, width: usize, batch: usize) -> Batch {
     let pyramid: Vec<Tensor<f32>> = (0..4).map(|scale| picture(scale, 31)).collect();
     let sources = [picture(0, 37), picture(0, 41)];
     let (w, h) = (width as f64, height as f64);
-    Batch {
-        seen: [sources[0].clone(), pyramid[0].clone(), sources[1].clone()],
-        pyramid,
-        sources,
-        intrinsics: vec![[0.58 * w, 1.92 * h, 0.5 * w, 0.5 * h]; batch],
-    }
+    Batch::in_time(pyramid, sources, vec![[0.58 * w, 1.92 * h, 0.5 * w, 0.5 * h]; batch])
 }
 
 #[test]
@@ -32,7 +27,7 @@ fn small_steps_tell_what_larger_ones_cost() {
         let data = triplets(h, w, batch);
         trainer.step(&data).expect("a first step");
         let (_, inference) = profile::record(false, || {
-            let image = Var::constant(data.seen[1].clone());
+            let image = Var::constant(data.target.clone());
             trainer.model.disparities(&Context::inference(&trainer.params), &image);
         });
         let (peak, step) = profile::record(false, || pool::peak_of(|| trainer.step(&data).expect("a step")).1);

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use parallax::data::camera::Camera;
+use parallax::data::stereo::Sources;
 use parallax::data::{self, open_folder};
 use parallax::formats::png::write_png;
 use parallax::monovit::Preset;
@@ -74,6 +75,9 @@ struct StreetArgs {
     /// Seed of everything random.
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// A second camera so far to the right, image_03: 0.54 is KITTI's distance [default: one camera].
+    #[arg(long, value_name = "METRES")]
+    baseline: Option<f64>,
     /// Add moving cars.
     #[arg(long)]
     moving_cars: bool,
@@ -94,7 +98,7 @@ fn check(args: &CheckArgs) -> Result<()> {
     check_size("--height", args.height)?;
     check_size("--width", args.width)?;
     let size = [args.height, args.width];
-    let data = open_folder(&args.dir, args.split.as_deref(), size, args.lens.or(Camera::Auto), true)?;
+    let data = open_folder(&args.dir, args.split.as_deref(), size, args.lens.or(Camera::Auto), true, Sources::Mono)?;
     let mut progress = Progress::new("samples", data.len() as u64);
     let found = data::check::check(data.as_ref(), |done| progress.set(done as u64, ""))?;
     progress.finish();
@@ -136,8 +140,14 @@ fn street(a: StreetArgs) -> Result<()> {
             return Err(Error::setting(name, format!("{value} is not from {least} to 20000")));
         }
     }
+    let baseline = a.baseline.unwrap_or(0.0);
+    if a.baseline.is_some_and(|b| !(b > 0.0 && b <= 10.0)) {
+        return Err(Error::setting("--baseline", format!("{baseline} is not a distance above 0, up to 10 metres")));
+    }
+    let cameras = if baseline > 0.0 { 2 } else { 1 };
     // All pictures are held until they are written.
-    let gigabytes = 3e-9 * [a.sequences, a.frames, a.height, a.width].iter().map(|&n| n as f64).product::<f64>();
+    let gigabytes =
+        3e-9 * cameras as f64 * [a.sequences, a.frames, a.height, a.width].iter().map(|&n| n as f64).product::<f64>();
     if gigabytes > MOST_GIGABYTES {
         let message = format!(
             "these pictures take {gigabytes:.0} GB of memory (at most {MOST_GIGABYTES}): fewer, or smaller ones"
@@ -151,9 +161,10 @@ fn street(a: StreetArgs) -> Result<()> {
         frames: a.frames,
         seed: a.seed,
         moving_cars: a.moving_cars,
+        baseline,
         ..StreetConfig::default()
     };
-    let progress = std::sync::Mutex::new(Progress::new("frames", (a.sequences * a.frames) as u64));
+    let progress = std::sync::Mutex::new(Progress::new("frames", (cameras * a.sequences * a.frames) as u64));
     let report = |done: usize, _: usize| {
         if let Ok(mut progress) = progress.lock() {
             progress.set(done as u64, "");

@@ -23,6 +23,7 @@ mod predict;
 mod progress;
 mod sheet;
 mod sizes;
+mod stereo;
 mod train;
 mod weights;
 

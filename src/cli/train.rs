@@ -17,6 +17,7 @@ use parallax::{Error, Result};
 use super::ablation;
 use super::camera::CameraArgs;
 use super::progress::Progress;
+use super::stereo::StereoArgs;
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -99,6 +100,8 @@ pub struct Args {
     /// Print `metrics.json` on standard output at the end, and nothing else there.
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    stereo: StereoArgs,
     #[command(flatten)]
     networks: ablation::Networks,
     #[command(flatten)]
@@ -316,6 +319,7 @@ impl Args {
             ("--allow-partial", self.allow_partial),
             ("--log-every", self.log_every.is_some()),
             ("--checkpoint-every", self.checkpoint_every.is_some()),
+            ("--sources or --baseline", self.stereo.any()),
             ("an ablation", self.networks.any() || self.loss.any()),
         ];
         match given.into_iter().find(|(_, given)| *given) {
@@ -372,6 +376,7 @@ fn configuration(args: &Args) -> Result<RunConfig> {
     c.allow_partial |= args.allow_partial;
     c.skip_bad_frames |= args.skip_bad_frames;
     c.camera = args.lens.or(c.camera);
+    args.stereo.apply(&mut c);
     args.networks.apply(&mut c.ablation);
     args.loss.apply(&mut c.loss);
     if let Some(rate) = args.learning_rate {

@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize};
 use super::DataSource;
 use super::augment::{Jitter, flip};
 use super::resize::lanczos;
+use super::stereo::{Baseline, Sources};
 use crate::camera::Intrinsics;
 use crate::error::{Error, Result};
 use crate::random::{Random, Stream};
@@ -35,29 +36,69 @@ impl Default for Augment {
     }
 }
 
-/// A batch of triplets, images as `[B, h, w, 3]` in [0, 1].
+/// How samples become batches.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Making {
+    /// What is done to samples.
+    pub augment: Augment,
+    /// The frames that targets are compared with.
+    pub sources: Sources,
+    /// The unit of the distance between two cameras.
+    pub baseline: Baseline,
+}
+
+impl From<Augment> for Making {
+    /// Of neighbours in time alone.
+    fn from(augment: Augment) -> Self {
+        Making { augment, ..Making::default() }
+    }
+}
+
+/// A batch of targets and what they are compared with, images as `[B, h, w, 3]` in [0, 1].
 #[derive(Clone, Debug)]
 pub struct Batch {
     /// The plain target at 1, 1/2, 1/4, 1/8 of its size.
     pub pyramid: Vec<Tensor<f32>>,
-    /// The plain previous and next frames.
-    pub sources: [Tensor<f32>; 2],
-    /// Previous, target and next frame as the networks see them.
-    pub seen: [Tensor<f32>; 3],
+    /// The plain sources: previous and next frame if there are [`neighbours`](Batch::neighbours), the other camera's
+    /// if there are [`shifts`](Batch::shifts); in this order.
+    pub sources: Vec<Tensor<f32>>,
+    /// The target as the networks see it.
+    pub target: Tensor<f32>,
+    /// The previous and the next frame as the networks see them, if targets are compared with them.
+    pub neighbours: Option<[Tensor<f32>; 2]>,
+    /// The x of the shift from each sample's camera to the other one, if targets are compared with its frames: points
+    /// move by it, in the unit of depth. Mirrored with the pictures.
+    pub shifts: Option<Vec<f64>>,
     /// fx, fy, cx, cy of each sample in pixels.
     pub intrinsics: Vec<[f64; 4]>,
 }
 
 impl Batch {
-    /// The sources at 1/2, 1/4, 1/8 of their size, made like the target's pyramid: for each scale the previous and the
-    /// next frames, `[B, h, w, 3]`.
-    pub fn smaller_sources(&self) -> Vec<[Tensor<f32>; 2]> {
-        let mut images = self.sources.each_ref().map(to_images);
+    /// Targets and their neighbours in time, which the networks see as they are.
+    pub fn in_time(pyramid: Vec<Tensor<f32>>, neighbours: [Tensor<f32>; 2], intrinsics: Vec<[f64; 4]>) -> Self {
+        let (target, sources) = (pyramid[0].clone(), neighbours.to_vec());
+        Batch { pyramid, sources, target, neighbours: Some(neighbours), shifts: None, intrinsics }
+    }
+
+    /// The sources at 1/2, 1/4, 1/8 of their size, made like the target's pyramid: for each scale all sources,
+    /// `[B, h, w, 3]`.
+    pub fn smaller_sources(&self) -> Vec<Vec<Tensor<f32>>> {
+        let mut images: Vec<_> = self.sources.iter().map(to_images).collect();
         let smaller = (1..SCALES).map(|_| {
-            images = images.each_ref().map(|of| of.iter().map(|i| lanczos(i, i.width() / 2, i.height() / 2)).collect());
-            images.each_ref().map(|of| to_tensor(&of.iter().collect::<Vec<_>>()))
+            for image in images.iter_mut().flatten() {
+                *image = lanczos(image, image.width() / 2, image.height() / 2);
+            }
+            images.iter().map(|of| to_tensor(&of.iter().collect::<Vec<_>>())).collect()
         });
         smaller.collect()
+    }
+
+    /// The rows `[R | t]` that map points of the targets' cameras to the other ones, `[B, 3, 4]`, if targets are
+    /// compared with what those saw: rectified cameras look the same way, and stand beside one another.
+    pub fn to_other_camera(&self) -> Option<Tensor<f32>> {
+        let shifts = self.shifts.as_ref()?;
+        let rows = |&x: &f64| [1.0, 0.0, 0.0, x as f32, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0];
+        Some(Tensor::from_vec([shifts.len(), 3, 4], shifts.iter().flat_map(rows).collect()))
     }
 }
 
@@ -147,13 +188,13 @@ impl SkipList {
     }
 
     /// The frames of a sample, or of the next one after it that can be read.
-    fn read(&self, data: &dyn DataSource, sample: usize) -> Result<(usize, [Arc<RgbImage>; 3])> {
+    fn read(&self, data: &dyn DataSource, sample: usize, sources: Sources) -> Result<(usize, Frames)> {
         for sample in (sample..data.len()).chain(0..sample) {
             let name = data.name(sample);
             if self.has(&name) {
                 continue;
             }
-            match frames(data, sample) {
+            match Frames::read(data, sample, sources) {
                 Ok(frames) => return Ok((sample, frames)),
                 Err(error) => drop(self.add(&name, &error.to_string())),
             }
@@ -163,17 +204,54 @@ impl SkipList {
     }
 }
 
-/// The previous, the target and the next frame of a sample.
-fn frames(data: &dyn DataSource, sample: usize) -> Result<[Arc<RgbImage>; 3]> {
-    Ok([data.image(sample, -1)?, data.image(sample, 0)?, data.image(sample, 1)?])
+/// The frames of a sample.
+struct Frames {
+    target: Arc<RgbImage>,
+    /// The previous and the next one.
+    neighbours: Option<[Arc<RgbImage>; 2]>,
+    /// The other camera's, and the x of the shift to it in metres.
+    other: Option<(Arc<RgbImage>, f64)>,
+}
+
+impl Frames {
+    fn read(data: &dyn DataSource, sample: usize, sources: Sources) -> Result<Frames> {
+        let neighbours = || Ok::<_, Error>([data.image(sample, -1)?, data.image(sample, 1)?]);
+        let neighbours = sources.in_time().then(neighbours).transpose()?;
+        let other = match sources.other_camera() {
+            true => {
+                let image = data.other_image(sample)?;
+                let unknown =
+                    || Error::setting("sources", format!("{}: its second camera stands nowhere", data.name(sample)));
+                Some((image, data.other_camera_at(sample).ok_or_else(unknown)?))
+            }
+            false => None,
+        };
+        Ok(Frames { target: data.image(sample, 0)?, neighbours, other })
+    }
+
+    /// As in a mirror: what stood to the right stands to the left.
+    fn mirrored(self) -> Frames {
+        let flip = |image: Arc<RgbImage>| Arc::new(flip(&image));
+        Frames {
+            target: flip(self.target),
+            neighbours: self.neighbours.map(|both| both.map(flip)),
+            other: self.other.map(|(image, shift)| (flip(image), -shift)),
+        }
+    }
 }
 
 /// The batch of a step (from 0).
 ///
 /// # Errors
 /// If a frame cannot be read.
-pub fn batch_of_step(data: &dyn DataSource, augment: Augment, batch: usize, seed: u64, step: u64) -> Result<Batch> {
-    assemble(data, augment, batch, seed, step, None)
+pub fn batch_of_step(
+    data: &dyn DataSource,
+    making: impl Into<Making>,
+    batch: usize,
+    seed: u64,
+    step: u64,
+) -> Result<Batch> {
+    assemble(data, making.into(), batch, seed, step, None)
 }
 
 /// The batch of a step (from 0), in which the next sample that can be read stands for one that cannot: that is put on the
@@ -183,58 +261,88 @@ pub fn batch_of_step(data: &dyn DataSource, augment: Augment, batch: usize, seed
 /// If no sample can be read.
 pub fn batch_of_readable(
     data: &dyn DataSource,
-    augment: Augment,
+    making: impl Into<Making>,
     batch: usize,
     seed: u64,
     step: u64,
     skip: &SkipList,
 ) -> Result<Batch> {
-    assemble(data, augment, batch, seed, step, Some(skip))
+    assemble(data, making.into(), batch, seed, step, Some(skip))
 }
 
 fn assemble(
     data: &dyn DataSource,
-    augment: Augment,
+    making: Making,
     batch: usize,
     seed: u64,
     step: u64,
     skip: Option<&SkipList>,
 ) -> Result<Batch> {
+    let Making { augment, sources, baseline } = making;
     let samples = samples_of_step(data.len(), batch, seed, step);
     let mut random = Random::of(seed, Stream::Augmentation(step));
-    let mut pyramids: Vec<Vec<Arc<RgbImage>>> = Vec::new();
-    let mut sources: [Vec<Arc<RgbImage>>; 2] = Default::default();
-    let mut seen: [Vec<Arc<RgbImage>>; 3] = Default::default();
-    let mut intrinsics = Vec::new();
+    let mut stacks = Stacks::default();
     for sample in samples {
         let (mirrored, jitter) = (random.coin() && augment.flip, Jitter::draw(random.chacha()));
         let jitter = jitter.filter(|_| augment.jitter);
         let (sample, frames) = match skip {
-            Some(skip) => skip.read(data, sample)?,
-            None => (sample, frames(data, sample)?),
+            Some(skip) => skip.read(data, sample, sources)?,
+            None => (sample, Frames::read(data, sample, sources)?),
         };
-        let plain = if mirrored { frames.map(|image| Arc::new(flip(&image))) } else { frames };
-        let (w, h) = plain[1].dimensions();
+        let frames = if mirrored { frames.mirrored() } else { frames };
+        let (w, h) = frames.target.dimensions();
         let camera = if mirrored { data.mirrored_intrinsics(sample, w as usize) } else { data.intrinsics(sample) };
-        intrinsics.push(in_pixels(camera, w as usize, h as usize));
-        let mut pyramid = vec![plain[1].clone()];
-        for s in 1..SCALES {
-            pyramid.push(Arc::new(lanczos(&pyramid[s - 1], w >> s, h >> s)));
-        }
-        pyramids.push(pyramid);
-        for (seen, image) in seen.iter_mut().zip(&plain) {
-            seen.push(jitter.as_ref().map_or_else(|| image.clone(), |j| Arc::new(j.apply(image))));
-        }
-        sources[0].push(plain[0].clone());
-        sources[1].push(plain[2].clone());
+        stacks.intrinsics.push(in_pixels(camera, w as usize, h as usize));
+        stacks.add(frames, jitter.as_ref(), baseline);
     }
-    let tensor = |images: Vec<Arc<RgbImage>>| to_tensor(&images.iter().map(Arc::as_ref).collect::<Vec<_>>());
-    Ok(Batch {
-        pyramid: (0..SCALES).map(|s| tensor(pyramids.iter().map(|p| p[s].clone()).collect())).collect(),
-        sources: sources.map(tensor),
-        seen: seen.map(tensor),
-        intrinsics,
-    })
+    Ok(stacks.batch())
+}
+
+/// The images of a batch while it grows.
+#[derive(Default)]
+struct Stacks {
+    pyramids: [Vec<Arc<RgbImage>>; SCALES],
+    target: Vec<Arc<RgbImage>>,
+    plain_neighbours: [Vec<Arc<RgbImage>>; 2],
+    neighbours: [Vec<Arc<RgbImage>>; 2],
+    other: Vec<Arc<RgbImage>>,
+    shifts: Vec<f64>,
+    intrinsics: Vec<[f64; 4]>,
+}
+
+impl Stacks {
+    fn add(&mut self, frames: Frames, jitter: Option<&Jitter>, baseline: Baseline) {
+        let seen = |image: &Arc<RgbImage>| jitter.map_or_else(|| image.clone(), |j| Arc::new(j.apply(image)));
+        self.target.push(seen(&frames.target));
+        let mut smaller = frames.target;
+        for (scale, pyramid) in self.pyramids.iter_mut().enumerate() {
+            if scale > 0 {
+                smaller = Arc::new(lanczos(&smaller, smaller.width() / 2, smaller.height() / 2));
+            }
+            pyramid.push(smaller.clone());
+        }
+        for (i, image) in frames.neighbours.into_iter().flatten().enumerate() {
+            self.neighbours[i].push(seen(&image));
+            self.plain_neighbours[i].push(image);
+        }
+        if let Some((image, metres)) = frames.other {
+            self.other.push(image);
+            self.shifts.push(baseline.shift(metres));
+        }
+    }
+
+    fn batch(self) -> Batch {
+        let tensor = |images: Vec<Arc<RgbImage>>| to_tensor(&images.iter().map(Arc::as_ref).collect::<Vec<_>>());
+        let sources = self.plain_neighbours.into_iter().chain([self.other]).filter(|images| !images.is_empty());
+        Batch {
+            sources: sources.map(tensor).collect(),
+            pyramid: self.pyramids.map(tensor).into(),
+            target: tensor(self.target),
+            neighbours: (!self.neighbours[0].is_empty()).then(|| self.neighbours.map(tensor)),
+            shifts: (!self.shifts.is_empty()).then_some(self.shifts),
+            intrinsics: self.intrinsics,
+        }
+    }
 }
 
 /// A thread that makes the batches of consecutive steps, a few ahead.
@@ -263,7 +371,7 @@ impl Loader {
     /// If there are fewer samples than a batch holds.
     pub fn start(
         data: Arc<dyn DataSource>,
-        augment: Augment,
+        making: impl Into<Making>,
         batch: usize,
         seed: u64,
         first_step: u64,
@@ -273,10 +381,11 @@ impl Loader {
             let message = format!("{batch} samples a batch, but the data holds {}: make it smaller", data.len());
             return Err(Error::setting("batch", message));
         }
+        let making = making.into();
         let (send, batches) = sync_channel(3);
         let thread = std::thread::spawn(move || {
             for step in first_step.. {
-                let make = || assemble(data.as_ref(), augment, batch, seed, step, skip.as_ref());
+                let make = || assemble(data.as_ref(), making, batch, seed, step, skip.as_ref());
                 // A panic becomes an error of this step, not a thread that is gone.
                 let made = catch_unwind(AssertUnwindSafe(make)).unwrap_or_else(|_| {
                     let samples = samples_of_step(data.len(), batch, seed, step);
@@ -338,7 +447,8 @@ mod tests {
         batch.sources[1] = batch.pyramid[0].clone();
         let smaller = batch.smaller_sources();
         assert_eq!(smaller.len(), 3);
-        for (scale, [previous, next]) in smaller.iter().enumerate() {
+        for (scale, of) in smaller.iter().enumerate() {
+            let [previous, next] = &of[..] else { panic!("two sources") };
             assert!(next.same_bits(&batch.pyramid[scale + 1]), "scale {}", scale + 1);
             assert!(!previous.same_bits(next));
         }
@@ -393,6 +503,67 @@ mod tests {
         }
         let beside = warped_with_the_truth(&street, &beside, &samples, &mirrored);
         assert!(beside.iter().zip(&again).zip(&mirrored).all(|((a, b), &m)| (a != b) == m), "{beside:?} {again:?}");
+    }
+
+    /// The mean difference between targets and what the other camera saw, warped by true depths and `metres` to it.
+    fn warped_from_the_other_camera(street: &Street, batch: &Batch, samples: &[usize], mirrored: &[bool]) -> f64 {
+        let (height, width) = (street.config().height, street.config().width);
+        let mut depths = Vec::new();
+        for (&sample, &mirrored) in samples.iter().zip(mirrored) {
+            let depth = street.depth(sample).unwrap().unwrap();
+            let metres: Vec<f32> = depth.metres.iter().map(|&m| if m > 0.0 { m } else { 500.0 }).collect();
+            depths.extend(if mirrored { crate::eval::metrics::mirror(&metres, width) } else { metres });
+        }
+        let depth = Var::constant(Tensor::from_vec([samples.len(), height, width, 1], depths));
+        let transform = Var::constant(batch.to_other_camera().unwrap());
+        let other = batch.sources.last().unwrap().clone();
+        let warped = Var::constant(other).warp(&depth, &transform, &batch.intrinsics, true);
+        let pairs = warped.value().data().iter().zip(batch.pyramid[0].data());
+        pairs.map(|(a, b)| f64::from((a - b).abs())).sum::<f64>() / batch.pyramid[0].len() as f64
+    }
+
+    #[test]
+    fn the_other_camera_of_a_pair_is_where_the_batch_says_also_in_a_mirror() {
+        let config = StreetConfig { sequences: 2, frames: 5, baseline: 0.54, ..StreetConfig::default() };
+        let street = Street::render(&config, None);
+        let samples = samples_of_step(street.len(), 4, 0, 0);
+        let of = |flip: bool, sources: Sources| {
+            let augment = Augment { flip, jitter: false };
+            batch_of_step(&street, Making { augment, sources, baseline: Baseline::Calibrated }, 4, 0, 0).unwrap()
+        };
+        let (plain, mixed) = (of(false, Sources::Both), of(true, Sources::Both));
+        let each = 3 * 96 * 320;
+        let parts = plain.pyramid[0].data().chunks(each).zip(mixed.pyramid[0].data().chunks(each));
+        let mirrored: Vec<bool> = parts.map(|(a, b)| a != b).collect();
+        assert!(mirrored.contains(&true) && mirrored.contains(&false), "{mirrored:?}");
+        let shifts: Vec<f64> = mirrored.iter().map(|&m| if m { 0.54 } else { -0.54 }).collect();
+        assert_eq!(mixed.shifts.as_ref(), Some(&shifts));
+
+        let good = warped_from_the_other_camera(&street, &plain, &samples, &[false; 4]);
+        let again = warped_from_the_other_camera(&street, &mixed, &samples, &mirrored);
+        assert!((good / again - 1.0).abs() < 1e-3, "{good} {again}");
+        // The wrong side, or another distance, is seen.
+        for factor in [-1.0, 0.0, 0.8, 1.25] {
+            let mut wrong = plain.clone();
+            wrong.shifts.iter_mut().flatten().for_each(|shift| *shift *= factor);
+            let wrong = warped_from_the_other_camera(&street, &wrong, &samples, &[false; 4]);
+            assert!(wrong > 1.2 * good, "{factor}: {wrong} {good}");
+        }
+
+        let (stereo, mono) = (of(true, Sources::Stereo), of(true, Sources::Mono));
+        assert_eq!((mono.sources.len(), mixed.sources.len(), stereo.sources.len()), (2, 3, 1));
+        assert!(mono.shifts.is_none() && stereo.neighbours.is_none());
+        assert!(stereo.sources[0].same_bits(&mixed.sources[2]) && mono.sources[1].same_bits(&mixed.sources[1]));
+        assert!(mono.target.same_bits(&stereo.target));
+    }
+
+    #[test]
+    fn a_street_of_one_camera_has_no_pairs() {
+        let config = StreetConfig { height: 32, width: 64, sequences: 1, frames: 4, ..StreetConfig::default() };
+        let making = Making { sources: Sources::Stereo, ..Making::default() };
+        let error = batch_of_step(&Street::render(&config, None), making, 1, 0, 0).unwrap_err().to_string();
+        assert!(error.contains("frame 1 has no second camera") || error.contains("frame 2 has no second"), "{error}");
+        assert!(error.contains("--sources mono"), "{error}");
     }
 
     /// A street of which some samples cannot be read.

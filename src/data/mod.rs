@@ -12,6 +12,7 @@ pub mod inputs;
 pub mod kitti;
 pub mod pyramid;
 pub mod resize;
+pub mod stereo;
 mod street;
 
 use std::path::Path;
@@ -19,6 +20,7 @@ use std::sync::Arc;
 
 use image::RgbImage;
 
+use self::stereo::Sources;
 use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
 use crate::{Error, Result};
@@ -74,10 +76,30 @@ pub trait DataSource: Send + Sync {
 
     /// Ground-truth depth of the target frame at its own size, where there is one.
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>>;
+
+    /// Where the other camera of a stereo pair stands: the x of the shift that maps points of the sample's camera to
+    /// points of the other one, in metres. Minus the baseline if the other one stands to the right; `None` if there is none.
+    fn other_camera_at(&self, _sample: usize) -> Option<f64> {
+        None
+    }
+
+    /// The target frame as the other camera of the stereo pair saw it, at the size the networks see.
+    ///
+    /// # Errors
+    /// If there is none, or it cannot be read.
+    fn other_image(&self, sample: usize) -> Result<Arc<RgbImage>> {
+        Err(no_second_camera(&self.name(sample)))
+    }
+}
+
+/// That of a sample that is asked for what a second camera saw, and there is none.
+fn no_second_camera(sample: &str) -> Error {
+    Error::setting("sources", format!("{sample} has no second camera: train with --sources mono"))
 }
 
 /// Opens a folder to train on: KITTI raw by its layout ([`kitti`]), or any folder of frames ([`frames`]). Of the samples,
-/// all with both neighbours, those that a list names, or all; pictures come out at `[height, width]` pixels.
+/// all with the `sources` that are asked for, those that a list names, or all; pictures come out at `[height, width]`
+/// pixels.
 ///
 /// # Errors
 /// As [`Kitti::open`](kitti::Kitti::open) and [`Frames::open`](frames::Frames::open).
@@ -87,6 +109,7 @@ pub fn open_folder(
     size: [usize; 2],
     camera: camera::Camera,
     skip_bad_frames: bool,
+    sources: Sources,
 ) -> Result<Arc<dyn DataSource>> {
     if root.is_file() {
         let message = "is a file: make a folder of frames of a film, for example with ffmpeg -i FILM -qscale:v 2 -vf \
@@ -98,8 +121,14 @@ pub fn open_folder(
         return Err(Error::file(root, message));
     }
     if kitti::is_kitti(root)? {
-        let options = kitti::Options { camera, skip_bad_frames, ..kitti::Options::default() };
+        let (neighbours, stereo) = (sources.in_time(), sources.other_camera());
+        let options = kitti::Options { camera, skip_bad_frames, neighbours, stereo, ..kitti::Options::default() };
         return Ok(Arc::new(kitti::Kitti::open(root, list, size[0], size[1], options)?));
+    }
+    if sources.other_camera() {
+        let message = "a folder of frames has one camera: train with --sources mono, or on KITTI raw, whose image_02 and \
+                       image_03 are a pair";
+        return Err(Error::setting("sources", message));
     }
     let options = frames::Options { camera, skip_bad_frames, ..frames::Options::default() };
     Ok(Arc::new(frames::Frames::open(root, list, size, options)?))
@@ -145,5 +174,11 @@ impl DataSource for Subset {
     }
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {
         self.data.depth(self.samples[sample])
+    }
+    fn other_camera_at(&self, sample: usize) -> Option<f64> {
+        self.data.other_camera_at(self.samples[sample])
+    }
+    fn other_image(&self, sample: usize) -> Result<Arc<RgbImage>> {
+        self.data.other_image(self.samples[sample])
     }
 }

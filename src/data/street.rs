@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use image::RgbImage;
 
-use super::{DataSource, Place};
+use super::{DataSource, Place, no_second_camera};
 use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
 use crate::street::Street;
@@ -39,6 +39,17 @@ impl DataSource for Street {
     fn place(&self, sample: usize) -> Place {
         let (sequence, frame) = self.locate(sample);
         Place { sequence, frame }
+    }
+
+    fn other_camera_at(&self, _sample: usize) -> Option<f64> {
+        let baseline = self.config().baseline;
+        (baseline != 0.0).then_some(-baseline)
+    }
+
+    fn other_image(&self, sample: usize) -> Result<Arc<RgbImage>> {
+        let (sequence, frame) = self.locate(sample);
+        let without = || no_second_camera(&self.name(sample));
+        self.right_frame(sequence, frame).cloned().ok_or_else(without)
     }
 
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {

@@ -39,6 +39,11 @@ impl Pose {
         })
     }
 
+    /// The pose of a camera that looks the same way, `metres` to the right.
+    pub(crate) fn beside(self, metres: f64) -> Pose {
+        Pose { position: std::array::from_fn(|i| self.position[i] + metres * self.rotation[i][0]), ..self }
+    }
+
     /// A world point in this camera's frame.
     pub(crate) fn to_camera(self, point: [f64; 3]) -> [f64; 3] {
         let d: [f64; 3] = std::array::from_fn(|k| point[k] - self.position[k]);

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! OUT/2011_09_26/calib_cam_to_cam.txt
-//! OUT/2011_09_26/2011_09_26_drive_0000_sync/image_02/data/0000000000.png
+//! OUT/2011_09_26/2011_09_26_drive_0000_sync/image_02/data/0000000000.png (and image_03 of a second camera)
 //! OUT/2011_09_26/2011_09_26_drive_0000_sync/proj_depth/groundtruth/image_02/0000000000.png
 //! OUT/2011_09_26/2011_09_26_drive_0000_sync/poses.txt
 //! OUT/splits/train_files.txt
@@ -39,12 +39,19 @@ pub fn write(street: &Street, out: &Path) -> Result<()> {
     for sequence in 0..config.sequences {
         let name = format!("{DAY}_drive_{sequence:04}_sync");
         let drive = day.join(&name);
-        let (images, depths) = (drive.join("image_02/data"), drive.join("proj_depth/groundtruth/image_02"));
+        let (images, right) = (drive.join("image_02/data"), drive.join("image_03/data"));
+        let depths = drive.join("proj_depth/groundtruth/image_02");
         folder(&images)?;
+        if config.baseline != 0.0 {
+            folder(&right)?;
+        }
         folder(&depths)?;
         for frame in 0..config.frames {
             let file = format!("{frame:010}.png");
             write_png(images.join(&file), street.frame(sequence, frame))?;
+            if let Some(image) = street.right_frame(sequence, frame) {
+                write_png(right.join(&file), image)?;
+            }
             let mut depth = street.frame_depth(sequence, frame);
             depth.metres.iter_mut().for_each(|z| *z = z.min(DEEPEST));
             write_depth_png(depths.join(&file), &depth)?;
@@ -73,22 +80,32 @@ fn line(pose: &Pose) -> String {
     numbers.join(" ") + "\n"
 }
 
-/// The entries of KITTI's calibration that readers use, for the left colour camera.
+/// The entries of KITTI's calibration that readers use, for the colour cameras that there are.
 fn calibration(config: &StreetConfig) -> String {
-    let (w, h, k) = (config.width as f64, config.height as f64, config.intrinsics);
-    let (fx, fy, cx, cy) = (k.fx * w, k.fy * h, k.cx * w, k.cy * h);
+    let left = camera(config, "02", 0.0);
+    let right = if config.baseline == 0.0 { String::new() } else { camera(config, "03", config.baseline) };
     format!(
         "calib_time: 26-Sep-2011 00:00:00\n\
          corner_dist: 1.000000e+00\n\
-         S_02: {w:?} {h:?}\n\
-         K_02: {fx:?} 0.0 {cx:?} 0.0 {fy:?} {cy:?} 0.0 0.0 1.0\n\
-         D_02: 0.0 0.0 0.0 0.0 0.0\n\
-         R_02: 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0\n\
-         T_02: 0.0 0.0 0.0\n\
          R_rect_00: 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0\n\
-         S_rect_02: {w:?} {h:?}\n\
-         R_rect_02: 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0\n\
-         P_rect_02: {fx:?} 0.0 {cx:?} 0.0 0.0 {fy:?} {cy:?} 0.0 0.0 0.0 1.0 0.0\n"
+         {left}{right}"
+    )
+}
+
+/// Those of one camera, `beside` metres to the right of the first.
+fn camera(config: &StreetConfig, number: &str, beside: f64) -> String {
+    let (w, h, k) = (config.width as f64, config.height as f64, config.intrinsics);
+    let (fx, fy, cx, cy) = (k.fx * w, k.fy * h, k.cx * w, k.cy * h);
+    let (away, shift) = (0.0 - beside, 0.0 - fx * beside);
+    format!(
+        "S_{number}: {w:?} {h:?}\n\
+         K_{number}: {fx:?} 0.0 {cx:?} 0.0 {fy:?} {cy:?} 0.0 0.0 1.0\n\
+         D_{number}: 0.0 0.0 0.0 0.0 0.0\n\
+         R_{number}: 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0\n\
+         T_{number}: {away:?} 0.0 0.0\n\
+         S_rect_{number}: {w:?} {h:?}\n\
+         R_rect_{number}: 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0\n\
+         P_rect_{number}: {fx:?} 0.0 {cx:?} {shift:?} 0.0 {fy:?} {cy:?} 0.0 0.0 0.0 1.0 0.0\n"
     )
 }
 
@@ -130,5 +147,29 @@ mod tests {
 
         let again = write(&street, &out).unwrap_err().to_string();
         assert!(again.contains("not empty") && again.contains("street"), "{again}");
+    }
+
+    #[test]
+    fn a_second_camera_is_read_back_as_the_other_one_of_a_pair() {
+        use crate::data::kitti::{Kitti, Options, Side};
+        let config =
+            StreetConfig { height: 32, width: 64, sequences: 1, frames: 4, baseline: 0.5, ..StreetConfig::default() };
+        let street = Street::render(&config, None);
+        let place = tempfile::tempdir().unwrap();
+        let out = place.path().join("street");
+        write(&street, &out).unwrap();
+        let options = Options { stereo: true, ..Options::default() };
+        let kitti = Kitti::open(&out, None, 32, 64, options).unwrap();
+        assert_eq!(kitti.len(), 4, "two frames of two cameras");
+        for sample in 0..kitti.len() {
+            let left = kitti.side(sample) == Side::Left;
+            assert!((kitti.other_camera_at(sample).unwrap() - if left { -0.5 } else { 0.5 }).abs() < 1e-12);
+            let frame = sample % 2 + 1;
+            let pair = [street.frame(0, frame), street.right_frame(0, frame).unwrap()];
+            let [this, other] = if left { pair } else { [pair[1], pair[0]] };
+            assert_eq!(&kitti.image(sample, 0).unwrap(), this);
+            assert_eq!(&kitti.other_image(sample).unwrap(), other);
+        }
+        assert!(kitti.image(0, 0).unwrap() != kitti.other_image(0).unwrap());
     }
 }

@@ -33,6 +33,8 @@ pub struct StreetConfig {
     pub moving_cars: bool,
     /// The camera.
     pub intrinsics: Intrinsics,
+    /// How far to the right a second camera stands, in metres; without one if 0.
+    pub baseline: f64,
 }
 
 impl Default for StreetConfig {
@@ -45,6 +47,7 @@ impl Default for StreetConfig {
             seed: 0,
             moving_cars: false,
             intrinsics: Intrinsics::KITTI,
+            baseline: 0.0,
         }
     }
 }
@@ -54,6 +57,8 @@ struct Sequence {
     world: World,
     poses: Vec<Pose>,
     images: Vec<Arc<RgbImage>>,
+    /// What a second camera saw; empty without one.
+    right: Vec<Arc<RgbImage>>,
 }
 
 /// Rendered streets, with exact depth and poses. A sample is a frame that has both neighbours.
@@ -70,22 +75,25 @@ impl Street {
     /// Renders all sequences, on rayon's threads; the pictures are the same for any number of them. `progress` gets the
     /// number of frames done and of all, from any thread.
     pub fn render(config: &StreetConfig, progress: Option<&(dyn Fn(usize, usize) + Sync)>) -> Street {
-        let total = config.sequences * config.frames;
+        let cameras = if config.baseline == 0.0 { 1 } else { 2 };
+        let total = config.sequences * config.frames * cameras;
         let done = AtomicUsize::new(0);
         let sequence = |k: usize| {
             let world = street(&mut Draw::new(config.seed, k as u64, WORLD), config.frames, config.moving_cars);
             let draw = &mut Draw::new(config.seed, k as u64, PATH);
             let poses = drive(draw, config.frames, world.lane, world.room, config.moving_cars);
-            let image = |(frame, pose): (usize, &Pose)| {
-                let image = Scene::new(&world, View::new(config, *pose), frame).image();
+            let image = |frame: usize, pose: Pose| {
+                let image = Scene::new(&world, View::new(config, pose), frame).image();
                 let done = done.fetch_add(1, Ordering::Relaxed) + 1;
                 if let Some(progress) = progress {
                     progress(done, total);
                 }
                 Arc::new(image)
             };
-            let images = poses.par_iter().enumerate().map(image).collect();
-            Sequence { world, poses, images }
+            let images = poses.par_iter().enumerate().map(|(frame, pose)| image(frame, *pose)).collect();
+            let right = poses.par_iter().enumerate().map(|(frame, pose)| image(frame, pose.beside(config.baseline)));
+            let right = if config.baseline == 0.0 { Vec::new() } else { right.collect() };
+            Sequence { world, poses, images, right }
         };
         Street { config: config.clone(), sequences: (0..config.sequences).into_par_iter().map(sequence).collect() }
     }
@@ -103,6 +111,12 @@ impl Street {
     /// A frame of a sequence. Panics if there is none such.
     pub fn frame(&self, sequence: usize, frame: usize) -> &Arc<RgbImage> {
         &self.sequences[sequence].images[frame]
+    }
+
+    /// A frame of a sequence as the second camera saw it, if there is one. Panics if there is no such frame.
+    pub fn right_frame(&self, sequence: usize, frame: usize) -> Option<&Arc<RgbImage>> {
+        let sequence = &self.sequences[sequence];
+        (!sequence.right.is_empty()).then(|| &sequence.right[frame])
     }
 
     /// The depth of a frame at the pixels' centres: camera z in metres, 0 for the sky. Panics if there is none such.

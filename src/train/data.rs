@@ -19,6 +19,8 @@ pub const STREET: &str = "street";
 const SEQUENCES: [usize; 3] = [144, 12, 24];
 /// Frames of each.
 const FRAMES: usize = 10;
+/// Where a second camera stands, if one is asked for: metres to the right, like KITTI's.
+const BASELINE: f64 = 0.54;
 /// The seeds of validation and test lie far from that of training: three worlds that have no street in common.
 const APART: u64 = 1_000_000;
 
@@ -39,14 +41,17 @@ pub fn open(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) +
 
 /// The bytes of pictures that are held in memory while a run goes on: all of the street's, none of a folder's.
 pub(super) fn bytes_held(config: &RunConfig) -> f64 {
-    let frames = if config.data == STREET { SEQUENCES.iter().sum::<usize>() * FRAMES } else { 0 };
+    let cameras = if config.sources.other_camera() { 2 } else { 1 };
+    let frames = if config.data == STREET { cameras * SEQUENCES.iter().sum::<usize>() * FRAMES } else { 0 };
     3.0 * (frames * config.height * config.width) as f64
 }
 
 fn street(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + Sync)) -> RunData {
     let RunConfig { height, width, seed, .. } = *config;
     let street = |what: &'static str, sequences: usize, seed: u64| {
-        let settings = StreetConfig { height, width, sequences, frames: FRAMES, seed, ..StreetConfig::default() };
+        let baseline = if config.sources.other_camera() { BASELINE } else { 0.0 };
+        let settings =
+            StreetConfig { height, width, sequences, frames: FRAMES, seed, baseline, ..StreetConfig::default() };
         Arc::new(Street::render(&settings, Some(&|done, all| progress(what, done, all))))
     };
     let [train, validation, test] = SEQUENCES;
@@ -60,7 +65,7 @@ fn street(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + S
 /// The samples of the run's folder that a list names, or all.
 fn samples(config: &RunConfig, list: Option<&Path>) -> Result<Arc<dyn DataSource>> {
     let size = [config.height, config.width];
-    open_folder(Path::new(&config.data), list, size, config.camera, config.skip_bad_frames)
+    open_folder(Path::new(&config.data), list, size, config.camera, config.skip_bad_frames, config.sources)
 }
 
 fn folder(config: &RunConfig) -> Result<RunData> {

@@ -8,8 +8,9 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::rotations::{RotationPlan, Rotations};
-use crate::data::batch::Augment;
+use crate::data::batch::{Augment, Making};
 use crate::data::camera::Camera;
+use crate::data::stereo::{Baseline, Sources};
 use crate::error::{Error, Result};
 use crate::formats::bounded::{MAX_SETTINGS, read_text};
 use crate::monovit::loss::LossConfig;
@@ -208,6 +209,12 @@ pub struct RunConfig {
     /// The camera that took a folder's pictures.
     #[serde(default)]
     pub camera: Camera,
+    /// The frames that a target is compared with: its neighbours in time, the other camera's, or both.
+    #[serde(default)]
+    pub sources: Sources,
+    /// The unit of the distance between two cameras: with the calibrated one depth is in metres.
+    #[serde(default)]
+    pub baseline: Baseline,
     /// Whether samples with a frame that cannot be read are passed over and counted; they end the run otherwise.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub skip_bad_frames: bool,
@@ -266,6 +273,8 @@ impl RunConfig {
             split: None,
             val_split: None,
             camera: Camera::Auto,
+            sources: Sources::Mono,
+            baseline: Baseline::Calibrated,
             skip_bad_frames: false,
             init: Vec::new(),
             init_encoder: None,
@@ -337,9 +346,18 @@ impl RunConfig {
             schedule: self.optim.schedule.over(self.steps),
             loss: self.loss,
             auto_mask_after: steps_of(self.auto_mask_delay, self.steps),
-            rotations: self.rotations.over(self.steps),
+            rotations: match self.sources.in_time() {
+                true => self.rotations.over(self.steps),
+                // No pose network is asked.
+                false => Rotations::default().over(self.steps),
+            },
             seed: self.seed,
         }
+    }
+
+    /// How its samples become batches.
+    pub fn making(&self) -> Making {
+        Making { augment: self.augment, sources: self.sources, baseline: self.baseline }
     }
 
     /// Checks what can be checked without data.

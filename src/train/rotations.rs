@@ -124,8 +124,12 @@ impl Lesson {
 const ROLL: f64 = 0.25;
 
 /// The mean error, in pixels, of the rotations that the pose network sees in turned neighbours.
+///
+/// # Panics
+/// If the batch holds none.
 pub fn rotation_error(model: &MonoVit, c: &Context<f32>, batch: &Batch, pixels: f64, random: &mut Random) -> Var<f32> {
-    let [prev, target, next] = &batch.seen;
+    let (target, neighbours) = (&batch.target, batch.neighbours.as_ref());
+    let [prev, next] = neighbours.expect("frames that follow one another");
     let mut turned = |frames: &Tensor<f32>| turn(frames, &angles(&batch.intrinsics, pixels, random), &batch.intrinsics);
     // Both frames of a pair are turned, so that which of them is interpolated says nothing.
     let firsts = [turned(prev), turned(target)];

@@ -205,9 +205,9 @@ impl Run {
         if self.validation_is_due() {
             self.validate(data, &validation, &mut log, &mut tell)?;
         }
-        let (augment, batch, seed) = (self.config.augment, self.config.batch, self.config.seed);
+        let (making, batch, seed) = (self.config.making(), self.config.batch, self.config.seed);
         let steps = self.trainer.steps();
-        let mut loader = Loader::start(data.train.clone(), augment, batch, seed, steps, self.skip_list())?;
+        let mut loader = Loader::start(data.train.clone(), making, batch, seed, steps, self.skip_list())?;
         tell(Event::Phase("training"));
         let (mut since, mut waited, mut counted) = (Instant::now(), 0.0, 0u32);
         while self.trainer.steps() < self.config.steps {
@@ -277,9 +277,9 @@ impl Run {
         }
         tell(Event::Phase("teaching the pose network what a rotation looks like"));
         let started = Instant::now();
-        let (augment, batch, seed) = (self.config.augment, self.config.batch, self.config.seed);
+        let (making, batch, seed) = (self.config.making(), self.config.batch, self.config.seed);
         // The same frames as in training, in another order.
-        let mut loader = Loader::start(data.train.clone(), augment, batch, seed ^ u64::MAX, 0, self.skip_list())?;
+        let mut loader = Loader::start(data.train.clone(), making, batch, seed ^ u64::MAX, 0, self.skip_list())?;
         let learnt = self.trainer.learn_rotations(
             || loader.next_batch(),
             |step, error| {

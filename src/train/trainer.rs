@@ -61,6 +61,16 @@ fn views(batch: &Batch, scales: Scales) -> Views<f32> {
     }
 }
 
+/// What maps points of the targets' cameras to those of their sources, `[B, 3, 4]` each: what the pose network sees in
+/// neighbours, what is known of a second camera.
+fn transforms(model: &MonoVit, c: &Context<f32>, batch: &Batch, target: &Var<f32>) -> Vec<Var<f32>> {
+    let in_time = batch.neighbours.as_ref().map(|neighbours| {
+        let [prev, next] = neighbours.each_ref().map(|t| Var::constant(t.clone()));
+        model.transforms(c, &prev, target, &next)
+    });
+    in_time.into_iter().flatten().chain(batch.to_other_camera().map(Var::constant)).collect()
+}
+
 impl Trainer {
     /// A model at its start.
     pub fn new(config: Config, plan: Plan) -> Self {
@@ -110,9 +120,9 @@ impl Trainer {
     fn forward(&self, tape: &Tape<f32>, batch: &Batch) -> (Context<f32>, Loss<f32>) {
         let step = self.adamw.steps;
         let c = Context::training(&self.params, tape, Random::of(self.plan.seed, Stream::Dropout(step)));
-        let [prev, target, next] = batch.seen.each_ref().map(|t| Var::constant(t.clone()));
+        let target = Var::constant(batch.target.clone());
         let disparities = self.model.disparities(&c, &target);
-        let transforms = self.model.transforms(&c, &prev, &target, &next);
+        let transforms = transforms(&self.model, &c, batch, &target);
         let mut random = Random::of(self.plan.seed, Stream::Ties(step));
         let auto_mask = self.plan.loss.auto_mask && step >= self.plan.auto_mask_after;
         let config = LossConfig { auto_mask, ..self.plan.loss };
@@ -208,9 +218,9 @@ impl Trainer {
     pub fn validate(&self, params: &Params<f32>, batches: &[Batch]) -> [f64; 3] {
         let c = Context::inference(params);
         let errors = batches.iter().map(|batch| {
-            let [prev, target, next] = batch.seen.each_ref().map(|t| Var::constant(t.clone()));
+            let target = Var::constant(batch.target.clone());
             let disparities = self.model.disparities(&c, &target);
-            let transforms = self.model.transforms(&c, &prev, &target, &next);
+            let transforms = transforms(&self.model, &c, batch, &target);
             let found = loss(&disparities[..1], &transforms, &views(batch, Scales::Full), &self.plan.loss, None);
             [found.photometric, found.warped, found.unwarped]
         });

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::log::Log;
 use super::run::{BEST, Event, Run, RunData, load_weights, write_weights};
 use crate::data::DataSource;
-use crate::data::batch::{Augment, Batch, batch_of_readable, batch_of_step};
+use crate::data::batch::{Augment, Batch, Making, batch_of_readable, batch_of_step};
 use crate::error::{Error, Result};
 use crate::eval::metrics::{MeanMap, Metrics, Protocol, Report, Scale};
 use crate::eval::predictor::{Evaluation, Predictor, evaluate, evaluate_mean_map};
@@ -66,7 +66,7 @@ const DENSE: Evaluation = Evaluation { protocol: Protocol::Dense, scale: Scale::
 impl Run {
     /// A fixed set of batches without augmentation; none if a frame cannot be read, which is told.
     pub(super) fn validation_batches(&self, data: &RunData, tell: &mut impl FnMut(Event)) -> Vec<Batch> {
-        let plain = Augment { flip: false, jitter: false };
+        let plain = Making { augment: Augment { flip: false, jitter: false }, ..self.config.making() };
         let size = self.config.batch.min(data.validation.len());
         let count = data.validation.len().checked_div(size).unwrap_or(0).min(10) as u64;
         let samples = data.validation.as_ref();

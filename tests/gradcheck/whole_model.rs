@@ -17,7 +17,8 @@ fn total(
 ) -> (Context<f64>, Var<f64>) {
     let constant = |t: &Tensor<f32>| Var::constant(t.cast::<f64>());
     let c = Context::training(params, tape, Random::new(0, 0));
-    let [prev, target, next] = batch.seen.each_ref().map(constant);
+    let target = constant(&batch.target);
+    let [prev, next] = batch.neighbours.as_ref().expect("neighbours in time").each_ref().map(constant);
     let views = Views {
         pyramid: batch.pyramid.iter().map(constant).collect(),
         sources: batch.sources.iter().map(constant).collect(),

@@ -88,7 +88,7 @@ impl Network {
 impl Job for Network {
     fn once(&mut self) -> Result<()> {
         let Some(folded) = &self.folded else { return self.trainer.step(&self.batch).map(drop) };
-        self.trainer.model.predict(folded, &self.batch.seen[1]);
+        self.trainer.model.predict(folded, &self.batch.target);
         Ok(())
     }
 }
@@ -132,10 +132,5 @@ fn batch(sizes: &Sizes, seed: u64) -> Batch {
     let pyramid: Vec<_> = (0..4).map(&mut picture).collect();
     let sources = [picture(0), picture(0)];
     let (w, h) = (sizes.width as f64, sizes.height as f64);
-    Batch {
-        seen: [sources[0].clone(), pyramid[0].clone(), sources[1].clone()],
-        pyramid,
-        sources,
-        intrinsics: vec![[0.58 * w, 1.92 * h, 0.5 * w, 0.5 * h]; sizes.batch],
-    }
+    Batch::in_time(pyramid, sources, vec![[0.58 * w, 1.92 * h, 0.5 * w, 0.5 * h]; sizes.batch])
 }

@@ -95,6 +95,28 @@ impl Calibration {
         self.camera(side).intrinsics()
     }
 
+    /// How far the right colour camera stands from the left one, in metres: `(P2x - P3x) / f`, of projections that differ
+    /// in nothing else that matters to a pair.
+    ///
+    /// # Errors
+    /// If they do: other focal lengths or principal points by more than a hundredth of a pixel, or the cameras in one
+    /// place or changed over. Names the file in the folder of a day.
+    pub fn baseline(&self, day: &Path) -> Result<f64> {
+        let [left, right] = self.cameras.each_ref().map(|camera| camera.matrix);
+        let wrong = |message: String| Err(Error::file(day.join(CAMERAS), message));
+        if let Some(i) = [0, 2, 5, 6].into_iter().find(|&i| (left[i] - right[i]).abs() > 0.01) {
+            let message = "a pair needs rectified cameras of one focal length and principal point";
+            return wrong(format!("P_rect_02 has {} where P_rect_03 has {}: {message}", left[i], right[i]));
+        }
+        let baseline = (left[3] - right[3]) / left[0];
+        match baseline > 0.0 && baseline.is_finite() {
+            true => Ok(baseline),
+            false => wrong(format!(
+                "by P_rect_02 and P_rect_03 the right camera stands {baseline} m to the right of the left one"
+            )),
+        }
+    }
+
     /// `P_rect_0c R_rect_00 Tr`, 3x4 row-major: from LiDAR coordinates (metres; x forward, y left, z up) to
     /// homogeneous pixels, whose third coordinate is camera z. `None` if the calibration was read without the LiDAR.
     pub fn lidar_to_image(&self, side: Side) -> Option<[f64; 12]> {

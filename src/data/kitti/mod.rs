@@ -34,6 +34,9 @@ use crate::depth::DepthMap;
 use crate::formats::picture::check_picture;
 use crate::{Error, Result};
 
+/// How far apart KITTI's colour cameras are where no calibration says it, in metres.
+const BASELINE: f64 = 0.54;
+
 /// Where ground-truth depth comes from.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum GroundTruth {
@@ -64,7 +67,7 @@ impl GroundTruth {
 pub struct Options {
     /// Every sample needs its previous and next frame (training); otherwise the target frame alone (evaluation).
     pub neighbours: bool,
-    /// Every sample needs the frame of the other camera ([`Kitti::other_camera`]).
+    /// Every sample needs the frame of the other camera ([`DataSource::other_image`]).
     pub stereo: bool,
     /// Whose intrinsics.
     pub camera: Camera,
@@ -156,6 +159,9 @@ pub struct Kitti {
     options: Options,
     /// Of each drive and side.
     cameras: BTreeMap<(usize, Side), camera::Found>,
+    /// How far apart the two colour cameras of each drive are, in metres, and where that was found, where pairs are asked
+    /// for.
+    baselines: BTreeMap<usize, (f64, String)>,
     left_out: LeftOut,
     unreadable: Vec<(String, String)>,
     pictures: Pictures<Frame>,
@@ -197,6 +203,7 @@ impl Kitti {
             samples: Vec::new(),
             options,
             cameras: BTreeMap::new(),
+            baselines: BTreeMap::new(),
             left_out: LeftOut::default(),
             unreadable: Vec::new(),
             pictures: Pictures::new(height, width, options.cache_bytes)?,
@@ -206,7 +213,27 @@ impl Kitti {
             None => kitti.take_everything(root)?,
         }
         kitti.find_cameras(root)?;
+        if options.stereo {
+            kitti.find_baselines()?;
+        }
         Ok(kitti)
+    }
+
+    /// Finds how far apart the cameras of every drive are that there are samples of.
+    fn find_baselines(&mut self) -> Result<()> {
+        let drives: HashSet<usize> = self.samples.iter().map(|frame| frame.drive).collect();
+        for drive in drives {
+            let day = self.drives[drive].day();
+            let found = match Calibration::has_cameras(day) {
+                true => (
+                    Calibration::read(day, false)?.baseline(day)?,
+                    day.join(calibration::CAMERAS).display().to_string(),
+                ),
+                false => (BASELINE, format!("KITTI's usual: {} has no {}", day.display(), calibration::CAMERAS)),
+            };
+            self.baselines.insert(drive, found);
+        }
+        Ok(())
     }
 
     /// Finds the camera of every drive and side that there are samples of.
@@ -475,12 +502,6 @@ impl Kitti {
         self.samples[sample].side
     }
 
-    /// The target frame of a sample as the other camera saw it, at the size the networks see.
-    pub fn other_camera(&self, sample: usize) -> Result<Arc<RgbImage>> {
-        let target = self.samples[sample];
-        self.picture(Frame { side: target.side.other(), ..target }, target)
-    }
-
     fn picture(&self, frame: Frame, target: Frame) -> Result<Arc<RgbImage>> {
         self.pictures.get(frame, || self.picture_path(frame, target))
     }
@@ -532,12 +553,30 @@ impl DataSource for Kitti {
     }
 
     fn cameras(&self) -> Vec<String> {
-        camera::in_words(self.cameras.values())
+        let mut words = camera::in_words(self.cameras.values());
+        let pairs = self.baselines.values().map(|(metres, found)| format!("pairs {metres:.4} m apart ({found})"));
+        for pair in pairs {
+            if !words.contains(&pair) {
+                words.push(pair);
+            }
+        }
+        words
     }
 
     fn place(&self, sample: usize) -> Place {
         let frame = self.samples[sample];
         Place { sequence: frame.drive, frame: frame.number as usize }
+    }
+
+    fn other_camera_at(&self, sample: usize) -> Option<f64> {
+        let frame = self.samples[sample];
+        let (baseline, _) = self.baselines.get(&frame.drive)?;
+        Some(if frame.side == Side::Left { -baseline } else { *baseline })
+    }
+
+    fn other_image(&self, sample: usize) -> Result<Arc<RgbImage>> {
+        let target = self.samples[sample];
+        self.picture(Frame { side: target.side.other(), ..target }, target)
     }
 
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {

@@ -74,7 +74,7 @@ fn frames_come_at_the_size_asked_for_and_in_the_order_of_time() {
         assert_eq!(picture.dimensions(), (12, 8));
         assert!(picture.pixels().all(|p| p.0 == [red, 200, 90]));
     }
-    assert_eq!(kitti.other_camera(0).unwrap().get_pixel(0, 0).0, [50, 200, 20]);
+    assert_eq!(kitti.other_image(0).unwrap().get_pixel(0, 0).0, [50, 200, 20]);
     assert_eq!(kitti.intrinsics(0), Intrinsics::KITTI);
     assert_eq!(kitti.depth(0).unwrap(), None);
     assert!(kitti.path(1, 1).unwrap().ends_with("day/drive/image_02/data/0000000005.png"));
@@ -377,4 +377,43 @@ fn a_measured_camera_needs_no_lidar() {
     assert_eq!(kitti.depth(0).unwrap(), None);
     let lidar = Options { ground_truth: GroundTruth::Lidar(DepthAxis::CameraZ), ..TARGET_ONLY };
     assert!(message(open(root.path(), Some("day/drive 5 r"), lidar)).contains("calib_velo_to_cam.txt"));
+}
+
+/// The calibration of a day whose cameras stand `shifts` pixels beside the first one, with principal points `cx`.
+fn pair_calibration(root: &Path, shifts: [f64; 2], cx: [f64; 2]) {
+    let camera = |n: usize| {
+        let (cx, shift) = (cx[n - 2], shifts[n - 2]);
+        format!("S_rect_0{n}: 1242 375\nP_rect_0{n}: 721.5377 0 {cx} {shift} 0 721.5377 172.854 0 0 0 1 0\n")
+    };
+    fs::write(root.join("day/calib_cam_to_cam.txt"), camera(2) + &camera(3)).unwrap();
+}
+
+#[test]
+fn pairs_stand_as_far_apart_as_the_calibration_says() {
+    let root = made_up(3..7);
+    let pairs = Options { stereo: true, ..TARGET_ONLY };
+    let usual = open(root.path(), None, pairs).unwrap();
+    assert_eq!(usual.other_camera_at(0), Some(-0.54), "nobody says otherwise");
+    assert!(
+        usual.cameras().iter().any(|c| c.contains("pairs 0.5400 m apart (KITTI's usual: ")),
+        "{:?}",
+        usual.cameras()
+    );
+    pair_calibration(root.path(), [44.85728, -339.5242], [609.5593; 2]);
+    let kitti = open(root.path(), Some("day/drive 4 l\nday/drive 4 r\n"), pairs).unwrap();
+    let expected = (44.85728 + 339.5242) / 721.5377;
+    let found = [0, 1].map(|sample| kitti.other_camera_at(sample).unwrap());
+    assert!((found[0] + expected).abs() < 1e-12 && (found[1] - expected).abs() < 1e-12, "{found:?}");
+    assert!(kitti.cameras().iter().any(|c| c.contains("pairs 0.5327 m apart (") && c.contains("calib_cam_to_cam")));
+    assert_eq!(open(root.path(), None, TARGET_ONLY).unwrap().other_camera_at(0), None, "nobody asked");
+
+    for (shifts, cx, what) in [
+        ([44.0, -339.0], [609.5593, 604.0], "P_rect_02 has 609.5593 where P_rect_03 has 604"),
+        ([-339.0, 44.0], [609.5593; 2], "stands -0.53"),
+        ([44.0, 44.0], [609.5593; 2], "stands 0 m to the right"),
+    ] {
+        pair_calibration(root.path(), shifts, cx);
+        let error = message(open(root.path(), None, pairs));
+        assert!(error.contains("calib_cam_to_cam.txt") && error.contains(what), "{error}");
+    }
 }

@@ -1,0 +1,74 @@
+//! Training on stereo pairs: alone, and together with neighbours in time.
+
+use parallax::data::batch::{Augment, Making, batch_of_step};
+use parallax::data::stereo::{Baseline, Sources};
+use parallax::monovit::Preset;
+use parallax::street::{Street, StreetConfig};
+use parallax::tensor::Tensor;
+use parallax::train::{RunConfig, Trainer};
+
+fn street() -> Street {
+    Street::render(
+        &StreetConfig { height: 64, width: 96, sequences: 1, frames: 6, baseline: 0.54, ..StreetConfig::default() },
+        None,
+    )
+}
+
+fn making(sources: Sources) -> Making {
+    Making { augment: Augment { flip: true, jitter: true }, sources, baseline: Baseline::Calibrated }
+}
+
+fn config(sources: Sources) -> RunConfig {
+    RunConfig { height: 64, width: 96, batch: 2, sources, ..RunConfig::new(Preset::Pico, 10) }
+}
+
+/// The names of the parameters that a step of a recipe moves.
+fn moved(sources: Sources) -> Vec<String> {
+    let config = config(sources);
+    let mut trainer = Trainer::new(config.model(), config.plan());
+    let before = trainer.params.clone();
+    let batch = batch_of_step(&street(), making(sources), 2, 0, 0).expect("a batch");
+    let report = trainer.step(&batch).expect("a step");
+    assert!(report.loss > 0.0 && report.warped > 0.0 && report.unwarped > 0.0);
+    let pairs = before.iter().zip(trainer.params.iter());
+    pairs.filter(|((_, a), (_, b))| !a.value.same_bits(&b.value)).map(|((_, a), _)| a.name().to_owned()).collect()
+}
+
+#[test]
+fn pairs_alone_teach_depth_and_no_motion() {
+    let any = |names: &[String], part: &str| names.iter().any(|name| name.starts_with(part));
+    let stereo = moved(Sources::Stereo);
+    assert!(any(&stereo, "encoder.") && any(&stereo, "depth.") && !any(&stereo, "pose"), "{stereo:?}");
+    let both = moved(Sources::Both);
+    assert!(any(&both, "encoder.") && any(&both, "depth.") && any(&both, "pose"), "{both:?}");
+}
+
+#[test]
+fn pairs_alone_need_no_lessons_of_rotations() {
+    assert!(config(Sources::Both).plan().rotations.steps > 0);
+    let plan = config(Sources::Stereo).plan();
+    assert_eq!((plan.rotations.steps, plan.rotations.keep), (0, 0));
+}
+
+/// The error of a pair is that of its own warp: another baseline, or the other camera's picture exchanged, changes it,
+/// and the minimum over three sources is at most that over two.
+#[test]
+fn validation_takes_the_smallest_error_over_all_sources() {
+    let street = street();
+    let errors = |sources: Sources, change: &dyn Fn(&mut parallax::data::batch::Batch)| {
+        let config = config(sources);
+        let trainer = Trainer::new(config.model(), config.plan());
+        let plain = Making { augment: Augment { flip: false, jitter: false }, ..making(sources) };
+        let mut batch = batch_of_step(&street, plain, 2, 0, 0).expect("a batch");
+        change(&mut batch);
+        trainer.validate(&trainer.params, &[batch])
+    };
+    let [mono, stereo, both] = [Sources::Mono, Sources::Stereo, Sources::Both].map(|s| errors(s, &|_| ()));
+    for i in 1..3 {
+        assert!(both[i] < mono[i] && both[i] < stereo[i], "{mono:?} {stereo:?} {both:?}");
+    }
+    let nearer = errors(Sources::Stereo, &|batch| batch.shifts.iter_mut().flatten().for_each(|x| *x *= 0.5));
+    assert!(nearer[1] != stereo[1] && nearer[2] == stereo[2], "only the warp knows of the baseline");
+    let grey = |batch: &mut parallax::data::batch::Batch| batch.sources[0] = Tensor::full([2, 64, 96, 3], 0.5);
+    assert!(errors(Sources::Stereo, &grey)[2] != stereo[2]);
+}
