@@ -22,7 +22,7 @@ fn triplets(height: usize, width: usize, batch: usize) -> Batch {
 fn small_steps_tell_what_larger_ones_cost() {
     let config = Preset::Pico.config();
     for ([h, w], batch) in [([96, 160], 1), ([64, 96], 3), ([160, 64], 2), ([128, 256], 2)] {
-        let cost = Cost::of(&config, [h, w], batch).expect("counted");
+        let cost = Cost::of(&config, [h, w], batch, false).expect("counted");
         let mut trainer = Trainer::new(config.clone(), RunConfig::usual().plan());
         let data = triplets(h, w, batch);
         trainer.step(&data).expect("a first step");

@@ -1,36 +1,29 @@
 //! Every case of every op with all pieces of work made small; and whether what a real training step cuts is among it.
-//!
-//! The sizes are a switch of the whole process (`tensor::regime`), hence a process of its own.
-
-use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use parallax::data::batch::{Augment, batch_of_step};
-use parallax::gradcheck::{Pieces, Regimes, SIZES, Subject};
+use parallax::gradcheck::{Pieces, Regimes, SIZES, Subject, for_each_case};
 use parallax::monovit::Preset;
 use parallax::ops::registry;
 use parallax::street::{Street, StreetConfig};
 use parallax::tensor::{parallel, regime};
 use parallax::train::{RunConfig, Trainer};
 
-fn take_turns() -> MutexGuard<'static, ()> {
-    static TURN: Mutex<()> = Mutex::new(());
-    TURN.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 #[test]
 fn every_piece_of_work_is_checked() {
-    let _turn = take_turns();
     let (mut regimes, mut failures, mut runs) = (Regimes::default(), Vec::new(), 0);
-    for case in registry::all().iter().flat_map(|entry| entry.cases()) {
-        let subject = Subject::new(case.as_ref(), 1);
+    let found = for_each_case(&registry::all(), |_, case| {
+        let subject = Subject::new(case, 1);
         let pieces = Pieces::new(&subject);
-        for size in SIZES {
+        SIZES.map(|size| {
             let found = pieces.check(size);
-            runs += usize::from(found.cuts.iter().any(|cut| cut.pieces > 1));
-            regimes.add(&found.cuts);
             let complain = |(check, why)| format!("{}, pieces of {size}, {check}: {why}", subject.what());
-            failures.extend(found.complaints.into_iter().map(complain));
-        }
+            (found.cuts, found.complaints.into_iter().map(complain).collect::<Vec<_>>())
+        })
+    });
+    for (cuts, complaints) in found.into_iter().flatten() {
+        runs += usize::from(cuts.iter().any(|cut| cut.pieces > 1));
+        regimes.add(&cuts);
+        failures.extend(complaints);
     }
     for ((op, algo, place), row) in &regimes.rows {
         println!("{op:24} {algo:20} {place:40} {:5} times, at most {:5} pieces", row.times, row.most);

@@ -117,7 +117,7 @@ fn check(args: &CheckArgs) -> Result<()> {
     for camera in &found.cameras {
         say!("camera: {camera}");
     }
-    let cost = Cost::of(&Preset::Nano.config(), size, 4)?;
+    let cost = Cost::of(&Preset::Nano.config(), size, 4, false)?;
     say!(
         "a step of nano, batch 4, takes about {:.2} s on this machine and {:.0} MiB: 1000 steps in {:.0} minutes",
         cost.seconds_step,

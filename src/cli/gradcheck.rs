@@ -1,9 +1,9 @@
 //! `parallax gradcheck`.
 
-use std::collections::BTreeMap;
+use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-use parallax::gradcheck::{CHECKS, Complaint, Regimes, Subject, check_everything};
+use parallax::gradcheck::{CHECKS, Complaint, Regimes, Subject, Verdict, check_everything, for_each_case};
 use parallax::ops::registry::{self, Entry};
 use parallax::random::{Random, Stream};
 use parallax::{Error, Result};
@@ -72,12 +72,10 @@ pub fn run(args: Args) -> Result<()> {
     let began = Instant::now();
     let checks = CHECKS.iter().map(|(name, _)| *name).collect();
     let mut table = Table { ops: Vec::new(), checks, drawn: 0, places: 0, complaints: Vec::new() };
-    let (mut regimes, mut progress) = (Regimes::default(), Progress::new("ops", chosen.len() as u64));
-    for (done, entry) in chosen.iter().enumerate() {
-        table.ops.extend(rows(entry, args.seed, &mut regimes, &mut table.complaints));
-        progress.set(done as u64 + 1, entry.name);
+    let mut regimes = Regimes::default();
+    for found in checked(&chosen, args.seed) {
+        table.add(found, &mut regimes);
     }
-    progress.finish();
     if args.thorough {
         table.drawn = drawn(&chosen, args.seed, &mut table.complaints);
     }
@@ -96,27 +94,54 @@ pub fn run(args: Args) -> Result<()> {
     }
 }
 
-/// Checks an op: a row for each of its kernel paths.
-fn rows(entry: &Entry, seed: u64, regimes: &mut Regimes, wrong: &mut Vec<Wrong>) -> Vec<Row> {
-    let mut rows: BTreeMap<&str, Row> = BTreeMap::new();
-    for case in entry.cases() {
+/// A case that was checked.
+struct Checked {
+    op: &'static str,
+    algo: &'static str,
+    verdict: Verdict,
+    milliseconds: f64,
+}
+
+/// Checks all cases of some ops.
+fn checked(chosen: &[Entry], seed: u64) -> Vec<Checked> {
+    let count = chosen.iter().map(|entry| entry.cases().len() as u64).sum();
+    let progress = Mutex::new((0, Progress::new("cases", count)));
+    let found = for_each_case(chosen, |entry, case| {
         let start = Instant::now();
-        let found = check_everything(&Subject::new(case.as_ref(), seed));
-        regimes.add(&found.cuts);
-        let (op, algo) = (entry.name, case.algo());
-        let none =
-            Row { op, algo, cases: 0, elements: 0, kinks: 0, max_error: 0.0, cut: 0, wrong: 0, milliseconds: 0.0 };
-        let row = rows.entry(algo).or_insert(none);
-        row.cases += 1;
-        row.elements += found.report.elements();
-        row.kinks += found.report.kinks();
-        row.max_error = row.max_error.max(found.report.error());
-        row.cut += found.sizes;
-        row.wrong += found.complaints.len();
-        row.milliseconds += start.elapsed().as_secs_f64() * 1e3;
-        wrong.extend(found.complaints.into_iter().map(|complaint| Wrong { op, complaint }));
+        let verdict = check_everything(&Subject::new(case, seed));
+        if let Ok(mut progress) = progress.lock() {
+            progress.0 += 1;
+            let done = progress.0;
+            progress.1.set(done, entry.name);
+        }
+        let milliseconds = start.elapsed().as_secs_f64() * 1e3;
+        Checked { op: entry.name, algo: case.algo(), verdict, milliseconds }
+    });
+    if let Ok(progress) = progress.lock() {
+        progress.1.finish();
     }
-    rows.into_values().collect()
+    found
+}
+
+impl Table {
+    /// Adds a case to the row of its op and kernel path.
+    fn add(&mut self, Checked { op, algo, verdict, milliseconds }: Checked, regimes: &mut Regimes) {
+        regimes.add(&verdict.cuts);
+        let i = self.ops.iter().position(|row| (row.op, row.algo) == (op, algo)).unwrap_or_else(|| {
+            let (max_error, milliseconds) = (0.0, 0.0);
+            self.ops.push(Row { op, algo, cases: 0, elements: 0, kinks: 0, max_error, cut: 0, wrong: 0, milliseconds });
+            self.ops.len() - 1
+        });
+        let row = &mut self.ops[i];
+        row.cases += 1;
+        row.elements += verdict.report.elements();
+        row.kinks += verdict.report.kinks();
+        row.max_error = row.max_error.max(verdict.report.error());
+        row.cut += verdict.sizes;
+        row.wrong += verdict.complaints.len();
+        row.milliseconds += milliseconds;
+        self.complaints.extend(verdict.complaints.into_iter().map(|complaint| Wrong { op, complaint }));
+    }
 }
 
 /// How long cases are drawn.

@@ -40,7 +40,7 @@ pub fn run(args: Args) -> Result<()> {
     let Args { sizes: args, networks } = args;
     args.check()?;
     let config = networks.config(args.preset)?;
-    let cost = Cost::of(&config, [args.height, args.width], args.batch)?;
+    let cost = Cost::of(&config, [args.height, args.width], args.batch, args.recompute)?;
     let (_, params) = MonoVit::new::<f32>(config, 0);
     let part = |prefix: &str| params.count(prefix);
     let parameters = Parameters {

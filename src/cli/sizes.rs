@@ -19,6 +19,9 @@ pub struct Sizes {
     /// Batch size, in pictures or triplets.
     #[arg(long, value_name = "N", default_value_t = 4)]
     pub batch: usize,
+    /// Compute transformer layers again in the backward pass of a step: less memory, more time.
+    #[arg(long)]
+    pub recompute: bool,
     /// Print one JSON object.
     #[arg(long)]
     pub json: bool,

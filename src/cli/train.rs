@@ -54,6 +54,9 @@ pub struct Args {
     /// Number of training steps; with --resume, the number to go on to [default: 3800].
     #[arg(long, value_name = "N", conflicts_with = "epochs")]
     steps: Option<u64>,
+    /// Compute transformer layers again in the backward pass: a step takes less memory and more time.
+    #[arg(long)]
+    recompute: bool,
     /// Steps between two lines of the log [default: 10].
     #[arg(long, value_name = "N")]
     log_every: Option<u64>,
@@ -257,6 +260,7 @@ fn resume(args: &Args, folder: &Path) -> Result<(Run, RunData)> {
             config.steps = steps;
         }
         config.skip_bad_frames |= args.skip_bad_frames;
+        config.recompute |= args.recompute;
         Ok(())
     };
     let run = Run::resume_with(folder, change, |warning| note!("warning: {warning}"))?;
@@ -375,6 +379,7 @@ fn configuration(args: &Args) -> Result<RunConfig> {
     }
     c.allow_partial |= args.allow_partial;
     c.skip_bad_frames |= args.skip_bad_frames;
+    c.recompute |= args.recompute;
     c.camera = args.lens.or(c.camera);
     args.stereo.apply(&mut c);
     args.networks.apply(&mut c.ablation);

@@ -111,6 +111,7 @@
 mod cases;
 mod differences;
 mod function;
+mod many;
 mod options;
 mod outcome;
 mod params;
@@ -126,6 +127,7 @@ mod tests;
 
 pub use cases::{CaseReport, check_case, draw, options_of};
 pub use differences::{Differences, Measured, Quotient, Tie, differences};
+pub use many::for_each_case;
 pub use options::{Cotangents, Kinks, Options, Stencil, Tolerance};
 pub use params::check_params;
 pub use pieces::{Crossed, Found, Pieces, Regimes, SIZES};

@@ -3,6 +3,8 @@
 //! Every stage embeds its input at several window sizes (a cascade of 3x3 depthwise-separable convolutions), sends each
 //! embedding through transformer layers and the first one through a convolutional block beside them, and fuses all.
 
+use std::sync::Arc;
+
 use super::config::Config;
 use crate::nn::{Builder, Context, Conv, ConvBn, ConvStart, DepthwiseConv, Init, LayerNorm, Linear, Normalised};
 use crate::ops::{Activation, Conv2d};
@@ -148,9 +150,15 @@ impl InvertedResidual {
 /// A transformer path: layers over the tokens of an embedding, which share their position encodings.
 #[derive(Clone, Debug)]
 struct TransformerPath {
+    encodings: Arc<Encodings>,
+    layers: Vec<Arc<TransformerLayer>>,
+}
+
+/// What the layers of a path know positions by: a depthwise convolution of the tokens, and that of their values.
+#[derive(Debug)]
+struct Encodings {
     position: DepthwiseConv,
     relative: RelativePosition,
-    layers: Vec<TransformerLayer>,
 }
 
 impl TransformerPath {
@@ -168,17 +176,18 @@ impl TransformerPath {
                 b.alias("cpe.proj.bias", bias.expect("made with a bias"));
                 relative.alias(&mut b.at("crpe"));
                 let drop_path = config.drop_path * (before + l) as f64 / (total - 1).max(1) as f64;
-                TransformerLayer::new(&mut b, config, &relative, channels, drop_path)
+                Arc::new(TransformerLayer::new(&mut b, config, &relative, channels, drop_path))
             })
             .collect();
-        TransformerPath { position, relative, layers }
+        TransformerPath { encodings: Arc::new(Encodings { position, relative }), layers }
     }
 
     fn forward<T: Float>(&self, c: &Context<T>, image: &Var<T>) -> Var<T> {
         let [b, h, w, channels] = image.shape().nhwc().expect("an image");
         let mut x = image.clone();
         for layer in &self.layers {
-            x = layer.forward(c, &self.position, &self.relative, &x);
+            let (layer, encodings) = (layer.clone(), self.encodings.clone());
+            x = c.part(&x, move |c, x| layer.forward(c, &encodings, x));
         }
         x.reshape([b, h, w, channels])
     }
@@ -257,13 +266,7 @@ impl TransformerLayer {
     }
 
     /// `x` is an image `[B, h, w, C]`, which is tokens `[B, h w, C]` read otherwise.
-    fn forward<T: Float>(
-        &self,
-        c: &Context<T>,
-        position: &DepthwiseConv,
-        relative: &RelativePosition,
-        x: &Var<T>,
-    ) -> Var<T> {
+    fn forward<T: Float>(&self, c: &Context<T>, Encodings { position, relative }: &Encodings, x: &Var<T>) -> Var<T> {
         let [b, h, w, channels] = x.shape().nhwc().expect("an image");
         let x = (x + position.forward(c, x)).reshape([b, h * w, channels]);
 

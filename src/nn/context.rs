@@ -2,12 +2,13 @@
 
 use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
+use std::rc::Rc;
 use std::sync::Arc;
 
 use super::Folded;
 use super::params::{Identity, ParamId, Params};
 use crate::random::{Random, Stream};
-use crate::tensor::{Float, Gradients, Precision, Tape, Tensor, Var, profile};
+use crate::tensor::{Float, Gradients, Precision, Tape, Tensor, Var, profile, recompute};
 
 /// Mode of normalisation layers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,6 +39,8 @@ pub struct Context<T: Float> {
     seen: Option<RefCell<HashMap<String, Tensor<T>>>>,
     /// Whether gradients were taken, so that this is a training step.
     differentiated: Cell<bool>,
+    /// Whether parts that offer it run once more in the backward pass instead of keeping what they computed.
+    recomputing: bool,
 }
 
 impl<T: Float> Context<T> {
@@ -79,7 +82,55 @@ impl<T: Float> Context<T> {
             random,
             seen: None,
             differentiated: Cell::new(false),
+            recomputing: false,
         }
+    }
+
+    /// This pass with the parts that offer it ([`part`](Context::part)) computed again in the backward pass: less memory,
+    /// more arithmetic.
+    pub fn recomputing(mut self, recomputing: bool) -> Self {
+        self.recomputing = recomputing;
+        self
+    }
+
+    /// `f(x)`, a part of a network that is computed again in the backward pass, if this pass is
+    /// [`recomputing`](Context::recomputing). `f` gets a context of its own, which it asks for its parameters. Running
+    /// statistics move once, and the dice fall the same both times.
+    #[track_caller]
+    pub fn part(&self, x: &Var<T>, f: impl Fn(&Context<T>, &Var<T>) -> Var<T> + 'static) -> Var<T> {
+        // Whoever looks at intermediate values looks at this context.
+        if !self.recomputing || self.seen.is_some() {
+            return f(self, x);
+        }
+        let (identities, mode, precision) = (self.identities.clone(), self.mode, self.precision);
+        let (dice, moved) = (self.random.borrow().clone(), self.moved.borrow().clone());
+        // Where the first run leaves its dice and statistics; when it runs again nobody asks.
+        let left = Rc::new(RefCell::new(None));
+        let leave = Rc::downgrade(&left);
+        let run = move |v: &[Var<T>]| {
+            let inner = Context {
+                vars: v[1..].to_vec(),
+                identities: identities.clone(),
+                mode,
+                precision,
+                moved: RefCell::new(moved.clone()),
+                random: RefCell::new(dice.clone()),
+                seen: None,
+                differentiated: Cell::new(false),
+                recomputing: false,
+            };
+            let y = f(&inner, &v[0]);
+            if let Some(leave) = leave.upgrade() {
+                let dice = inner.random.borrow().clone();
+                leave.replace(Some((dice, inner.into_moved())));
+            }
+            y
+        };
+        let y = recompute(&[x].into_iter().chain(&self.vars).collect::<Vec<_>>(), run);
+        if let Some((dice, moved)) = left.take() {
+            (*self.random.borrow_mut(), *self.moved.borrow_mut()) = (dice, moved);
+        }
+        y
     }
 
     /// This pass with intermediate values kept: those that modules [`observe`](Context::observe).

@@ -8,6 +8,7 @@
 //! | [`pool`] | buffers that are reused, not allocated |
 //! | `data` | [`Tensor`]: a shape over shared memory |
 //! | [`tape`] | the record of a computation, and its reversal |
+//! | `recompute` | parts that run once more in the backward pass, and keep nothing |
 //! | [`var`] | [`Var`]: a tensor that a tape may track |
 //! | [`gradients`] | where gradients are accumulated and read |
 //! | [`gemm`] | matrix products (faer) |
@@ -27,6 +28,7 @@ pub mod gradients;
 pub mod parallel;
 pub mod pool;
 pub mod profile;
+mod recompute;
 pub mod regime;
 pub(crate) mod register_tile;
 pub mod shape;
@@ -40,6 +42,7 @@ pub use data::Tensor;
 pub use float::Float;
 pub use gemm::Accum;
 pub use gradients::{GradSink, Gradients, Upstream};
+pub use recompute::recompute;
 pub use shape::Shape;
 pub use tape::Tape;
 pub use var::Var;

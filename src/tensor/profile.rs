@@ -116,6 +116,18 @@ fn listen<R>(look_for_nan: bool, f: impl FnOnce() -> R) -> (R, Profile) {
     (result, Profile { total, ..profile })
 }
 
+/// Runs `f`, whose ops will not be reversed, for whoever listens.
+pub(super) fn without_backward<R>(f: impl FnOnce() -> R) -> R {
+    let ops = || TRACE.with_borrow(|trace| trace.as_ref().map_or(0, |listening| listening.profile.ops.len()));
+    let first = ops();
+    let result = f();
+    TRACE.with_borrow_mut(|trace| {
+        let ops = trace.iter_mut().flat_map(|listening| listening.profile.ops.iter_mut().skip(first));
+        ops.for_each(|entry| entry.back = Work { flops: 0, bytes: 0 });
+    });
+    result
+}
+
 /// Runs `f` as a part with a name, for whoever listens: what takes time and is no op.
 ///
 /// ```

@@ -95,7 +95,7 @@ impl<T: Float> Tape<T> {
         Rc::ptr_eq(&self.0, &other.0)
     }
 
-    /// Adds an op that ran. Called by `ops::apply` alone.
+    /// Adds an op that ran, or a part that runs again. Called by `ops::apply` and `recompute` alone.
     #[track_caller]
     pub(crate) fn record(
         &self,

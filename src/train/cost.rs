@@ -9,7 +9,7 @@ use std::path::Path;
 use std::time::Instant;
 
 use super::data::bytes_held;
-use super::recipe::RunConfig;
+use super::recipe::{Plan, RunConfig};
 use super::trainer::Trainer;
 use crate::data::batch::Batch;
 use crate::error::{Error, Result};
@@ -47,12 +47,12 @@ const OVERHEAD: f64 = 1.12;
 
 impl Cost {
     /// Counts what a network costs at a picture size and batch size. Memory is counted for the whole process: nothing else
-    /// should run meanwhile.
+    /// should run meanwhile. With `recompute`, transformer layers are computed again in the backward pass.
     ///
     /// # Errors
     /// If a step on small pictures cannot be taken.
-    pub fn of(config: &Config, [height, width]: [usize; 2], batch: usize) -> Result<Cost> {
-        let plan = RunConfig::usual().plan();
+    pub fn of(config: &Config, [height, width]: [usize; 2], batch: usize, recompute: bool) -> Result<Cost> {
+        let plan = Plan { recompute, ..RunConfig::usual().plan() };
         let mut trainer = Trainer::new(config.clone(), plan);
         let parameters = 4.0 * trainer.params.count("") as f64;
         let [small, large] = SMALL;
@@ -114,7 +114,8 @@ pub fn check_memory(config: &RunConfig) -> Result<()> {
     if held + MOST_PARAMETERS + MOST_A_PIXEL * (config.batch * config.height * config.width) as f64 <= free {
         return Ok(());
     }
-    let cost = Cost::of(&config.ablation.apply(config.preset.config()), [config.height, config.width], config.batch)?;
+    let network = config.ablation.apply(config.preset.config());
+    let cost = Cost::of(&network, [config.height, config.width], config.batch, config.recompute)?;
     let needed = held + cost.bytes_step;
     if needed <= free {
         return Ok(());
@@ -124,13 +125,14 @@ pub fn check_memory(config: &RunConfig) -> Result<()> {
         "batch",
         format!(
             "training {} at {}x{}, batch {}, needs about {:.1} GiB, and {:.1} GiB are free: take a smaller \
-             batch, smaller pictures or a smaller preset",
+             batch, smaller pictures or a smaller preset{}",
             config.preset.name(),
             config.width,
             config.height,
             config.batch,
             gib(needed),
-            gib(free)
+            gib(free),
+            if config.recompute { "" } else { ", or --recompute" }
         ),
     ))
 }

@@ -179,6 +179,8 @@ pub struct Plan {
     pub auto_mask_after: u64,
     /// Known rotations for the pose network.
     pub rotations: RotationPlan,
+    /// Whether transformer layers are computed again in the backward pass.
+    pub recompute: bool,
     /// Seed of everything random.
     pub seed: u64,
 }
@@ -233,6 +235,10 @@ pub struct RunConfig {
     /// The disparity (sigmoid, in (0, 1)) that an untrained network predicts: the biases of the four heads. Without, as
     /// they are drawn: about 1/2, which is so near that what is nearer still has no disparity left.
     pub initial_disparity: Option<f64>,
+    /// Whether transformer layers are computed again in the backward pass instead of keeping what they computed: a step
+    /// takes less memory and more time, and learns the same.
+    #[serde(default)]
+    pub recompute: bool,
     /// A line in the log every so many steps.
     pub log_every: u64,
     /// The whole state is written, and the weights are validated, every so many steps.
@@ -281,6 +287,7 @@ impl RunConfig {
             init_pose: None,
             allow_partial: false,
             initial_disparity: Some(0.15),
+            recompute: false,
             log_every: 10,
             checkpoint_every: 200,
             ablation: Ablation::default(),
@@ -351,6 +358,7 @@ impl RunConfig {
                 // No pose network is asked.
                 false => Rotations::default().over(self.steps),
             },
+            recompute: self.recompute,
             seed: self.seed,
         }
     }

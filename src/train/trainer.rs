@@ -120,6 +120,7 @@ impl Trainer {
     fn forward(&self, tape: &Tape<f32>, batch: &Batch) -> (Context<f32>, Loss<f32>) {
         let step = self.adamw.steps;
         let c = Context::training(&self.params, tape, Random::of(self.plan.seed, Stream::Dropout(step)));
+        let c = c.recomputing(self.plan.recompute);
         let target = Var::constant(batch.target.clone());
         let disparities = self.model.disparities(&c, &target);
         let transforms = transforms(&self.model, &c, batch, &target);

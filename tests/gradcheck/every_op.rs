@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use parallax::gradcheck::{Gradients, Report, check_case};
+use parallax::gradcheck::{Check, Gradients, Report, check_case, for_each_case};
 use parallax::ops::case::TOLERANCE;
 use parallax::ops::registry;
 use parallax::ops::{Case, Checked, CustomOp, Input, Needs, Op, ShapeError};
@@ -31,32 +31,34 @@ fn scaled(gradients: &Gradients, input: usize, factor: f64) -> Gradients {
 #[test]
 fn every_op_passes_every_check_and_no_changed_gradient_does() {
     let _turn = crate::take_turns();
-    let mut failures = Vec::new();
-    let mut table: BTreeMap<&str, Row> = BTreeMap::new();
-    for entry in registry::all() {
-        for case in entry.cases() {
-            let subject = Subject::new(case.as_ref(), 1);
-            for (name, check) in CHECKS {
-                failures.extend(check(&subject).err().map(|why| format!("{}, {name}: {why}", subject.what())));
-            }
-            let (analytic, report) = (subject.gradients(), subject.report());
-            let row = table.entry(entry.name).or_default();
-            (row.cases, row.error) = (row.cases + 1, row.error.max(report.error()));
+    let found = for_each_case(&registry::all(), |entry, case| {
+        let subject = Subject::new(case, 1);
+        let complain =
+            |(name, check): &(&str, Check)| Some(format!("{}, {name}: {}", subject.what(), check(&subject).err()?));
+        let mut failures: Vec<String> = CHECKS.iter().filter_map(complain).collect();
+        let (analytic, report) = (subject.gradients(), subject.report());
+        let mut changed = 0;
 
-            // The comparison itself: a gradient that is off by ten times the tolerance, or missing, must not pass.
-            for (i, input) in report.inputs.iter().enumerate() {
-                if input.as_ref().is_none_or(|r| r.scale == 0.0) {
-                    continue;
-                }
-                for (how, factor) in [("scaled", 1.0 + 10.0 * case.tolerance()), ("dropped", 0.0)] {
-                    row.changed += 1;
-                    let changed = scaled(&analytic, i, factor);
-                    if Report::new(&changed, subject.measured(), &subject.options).failure().is_none() {
-                        failures.push(format!("{}: a {how} gradient of input {i} passes", subject.what()));
-                    }
+        // The comparison itself: a gradient that is off by ten times the tolerance, or missing, must not pass.
+        for (i, input) in report.inputs.iter().enumerate() {
+            if input.as_ref().is_none_or(|r| r.scale == 0.0) {
+                continue;
+            }
+            for (how, factor) in [("scaled", 1.0 + 10.0 * case.tolerance()), ("dropped", 0.0)] {
+                changed += 1;
+                let changed = scaled(&analytic, i, factor);
+                if Report::new(&changed, subject.measured(), &subject.options).failure().is_none() {
+                    failures.push(format!("{}: a {how} gradient of input {i} passes", subject.what()));
                 }
             }
         }
+        (entry.name, report.error(), changed, failures)
+    });
+    let (mut failures, mut table) = (Vec::new(), BTreeMap::<&str, Row>::new());
+    for (op, error, changed, complaints) in found {
+        let row = table.entry(op).or_default();
+        *row = Row { cases: row.cases + 1, error: row.error.max(error), changed: row.changed + changed };
+        failures.extend(complaints);
     }
     for (op, Row { cases, error, changed }) in &table {
         println!("{op:32} {cases:3} cases  {error:.1e}  {changed:3} changed gradients caught");

@@ -92,7 +92,7 @@ mod tests {
     use crate::cli::bench::job::{Job, Network, measure};
     use crate::cli::sizes::Sizes;
 
-    const PICO: Sizes = Sizes { preset: Preset::Pico, height: 64, width: 96, batch: 1, json: false };
+    const PICO: Sizes = Sizes { preset: Preset::Pico, height: 64, width: 96, batch: 1, recompute: false, json: false };
 
     #[test]
     fn the_rows_of_a_training_step_add_up_to_the_traced_total() {

@@ -79,6 +79,7 @@ impl Network {
         config.auto_mask_delay = 0.0;
         config.rotations.keep = 0.0;
         config.seed = seed;
+        config.recompute = sizes.recompute;
         let trainer = Trainer::new(config.model(), config.plan());
         let folded = infer.map(|precision| Folded::new(&trainer.params).with_precision(precision));
         Ok(Network { trainer, batch: batch(sizes, seed), folded })
