@@ -14,33 +14,42 @@ fn batch() -> Batch {
     batch_of_step(&Street::render(&config, None), Augment::default(), 2, 0, 0).expect("a batch")
 }
 
-/// Gradients of the disparities' squares by every parameter, the statistics that moved, and the next number of the dice,
-/// of a network whose layers are dropped half of the time.
-fn gradients(recomputing: bool) -> (Vec<Option<Tensor<f64>>>, Vec<(ParamId, Tensor<f64>)>, usize) {
+/// What a step takes from its tape.
+struct Taken {
+    /// By every parameter.
+    gradients: Vec<Option<Tensor<f64>>>,
+    /// The statistics that moved.
+    moved: Vec<(ParamId, Tensor<f64>)>,
+    /// Nodes on the tape.
+    nodes: usize,
+}
+
+/// Gradients of the disparities' squares, of a network whose layers are dropped half of the time.
+fn taken(recomputing: bool) -> Taken {
     let config = parallax::monovit::Config { drop_path: 0.5, ..Preset::Pico.config() };
     let (model, params) = MonoVit::new::<f64>(config, 3);
     let (tape, image) = (Tape::new(), batch().target.cast());
     let c = Context::training(&params, &tape, Random::new(5, 0)).recomputing(recomputing);
     let disparities = model.disparities(&c, &Var::constant(image));
     let sum = disparities.iter().map(|d| d.square().sum_all()).reduce(|a, b| a + b).expect("four scales");
-    let ops = tape.len();
-    let found = c.gradients(&mut sum.backward());
+    let nodes = tape.len();
+    let gradients = c.gradients(&mut sum.backward());
     let mut moved: Vec<_> = c.into_moved().into_iter().collect();
     moved.sort_by_key(|(id, _)| *id);
-    (found, moved, ops)
+    Taken { gradients, moved, nodes }
 }
 
 #[test]
 fn gradients_and_statistics_are_those_of_layers_that_are_computed_once() {
-    let (once, twice) = (gradients(false), gradients(true));
-    assert!(twice.2 < once.2, "{} nodes for {}", twice.2, once.2);
-    assert_eq!(once.1.len(), twice.1.len());
-    assert!(!once.1.is_empty());
-    for ((a, moved), (b, again)) in once.1.iter().zip(&twice.1) {
+    let (once, twice) = (taken(false), taken(true));
+    assert!(twice.nodes < once.nodes, "{} nodes for {}", twice.nodes, once.nodes);
+    assert_eq!(once.moved.len(), twice.moved.len());
+    assert!(!once.moved.is_empty());
+    for ((a, moved), (b, again)) in once.moved.iter().zip(&twice.moved) {
         assert!(a == b && moved.same_bits(again));
     }
     let mut compared = 0;
-    for (a, b) in once.0.iter().zip(&twice.0) {
+    for (a, b) in once.gradients.iter().zip(&twice.gradients) {
         assert_eq!(a.is_some(), b.is_some());
         let (Some(a), Some(b)) = (a, b) else { continue };
         let scale = a.data().iter().fold(0.0f64, |most, x| most.max(x.abs()));
