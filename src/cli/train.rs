@@ -208,6 +208,7 @@ fn show(event: &Event, progress: &mut Progress, stop: &Stop) {
                 v.validated, v.photometric, v.warped, v.unwarped
             ));
         }
+        Event::Health(warning) => progress.say(&format!("warning: {}", warning.message)),
         Event::Warning(what) => progress.say(&format!("warning: {what}")),
     }
 }

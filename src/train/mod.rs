@@ -2,6 +2,7 @@
 
 pub mod cost;
 pub mod data;
+pub mod health;
 mod log;
 pub mod recipe;
 pub mod rotations;
@@ -10,6 +11,7 @@ pub mod start;
 mod state;
 pub mod trainer;
 mod validation;
+pub mod vitals;
 
 pub use recipe::{OptimConfig, Plan, RunConfig};
 pub use trainer::{StepReport, Trainer};

@@ -1,7 +1,8 @@
 //! A training run: its folder, and the loop that fills it.
 //!
-//! `RUN/config.toml` (all of it, to run it again), `log.jsonl` (a line a logged step and a validation), `checkpoints/` (the
-//! whole state, and the one before it), `best.safetensors`, `metrics.json`, `images/`.
+//! `RUN/config.toml` (all of it, to run it again), `log.jsonl` (a line a logged step and a validation), `warnings.jsonl` (a
+//! line where a warning of [`health`](super::health) begins or ends), `checkpoints/` (the whole state, and the one before
+//! it), `best.safetensors`, `metrics.json`, `images/`.
 //!
 //! What is computed is never lost: the state is written before anything is measured, and nothing that only concerns
 //! reporting ends a training.
@@ -13,6 +14,7 @@ use std::time::Instant;
 
 use serde::Serialize;
 
+use super::health::{Monitor, Warning};
 use super::log::{self, Log};
 use super::recipe::{RunConfig, read_config};
 use super::start::Start;
@@ -61,6 +63,8 @@ pub enum Event<'a> {
     Validating,
     /// Weights were validated.
     Validated(&'a Validation),
+    /// A sign that the training goes wrong begins to show, for the first time.
+    Health(&'a Warning),
     /// Something could not be measured, and why; training goes on.
     Warning(&'a str),
 }
@@ -197,7 +201,8 @@ impl Run {
         }
         let mean_map = self.measure_beforehand(data, &mut tell);
         let validation = self.validation_batches(data, &mut tell);
-        let mut log = Log::open(&self.folder)?;
+        let mut log = Log::open(&self.folder, log::LOG)?;
+        let mut health = Health::open(&self.folder)?;
         if !self.learn_rotations(data, &stop, &mut tell)? {
             // The state on disk is that before the first of these steps: they will be taken again.
             return Ok(Ended::Interrupted(0));
@@ -233,6 +238,7 @@ impl Run {
                 let n = f64::from(counted);
                 let (seconds, data_seconds) = (since.elapsed().as_secs_f64() / n, waited / n);
                 log.write(&StepLine { step: report, seconds, data_seconds })?;
+                health.see(&report, &mut tell)?;
                 self.notes.seconds += since.elapsed().as_secs_f64();
                 (since, waited, counted) = (Instant::now(), 0.0, 0);
             }
@@ -304,6 +310,31 @@ impl Run {
         }
         let weights = self.trainer.weights();
         write_weights(&self.folder.join(BEST), &weights, &self.config.setup())
+    }
+}
+
+/// The monitor of a run, and where it writes to.
+struct Health {
+    monitor: Monitor,
+    log: Log,
+}
+
+impl Health {
+    /// A monitor that has seen what the run has logged already.
+    fn open(folder: &Path) -> Result<Self> {
+        let mut monitor = Monitor::default();
+        log::steps(folder)?.iter().for_each(|step| drop(monitor.see(step)));
+        Ok(Health { monitor, log: Log::open(folder, log::WARNINGS)? })
+    }
+
+    fn see(&mut self, step: &StepReport, tell: &mut impl FnMut(Event)) -> Result<()> {
+        for warning in self.monitor.see(step) {
+            self.log.write(&warning)?;
+            if warning.first {
+                tell(Event::Health(&warning));
+            }
+        }
+        Ok(())
     }
 }
 

@@ -4,16 +4,17 @@ use serde::{Deserialize, Serialize};
 
 use super::recipe::Plan;
 use super::rotations::Lesson;
+use super::vitals::{Signs, Vitals};
 use crate::data::batch::Batch;
 use crate::error::{Error, Result};
 use crate::monovit::MonoVit;
 use crate::monovit::config::Config;
 use crate::monovit::loss::{Loss, LossConfig, Scales, TieBreak, Views, loss};
 use crate::nn::{Context, Params};
-use crate::optim::{AdamW, Average, Group, clip_norm};
+use crate::optim::{AdamW, Average, Group, clip_from, norms};
 use crate::random::{Random, Stream};
 use crate::tensor::profile;
-use crate::tensor::{Tape, Var};
+use crate::tensor::{Tape, Tensor, Var};
 
 /// The figures of a step.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -36,6 +37,12 @@ pub struct StepReport {
     pub learning_rates: [f64; 3],
     /// The norm of all gradients, before clipping.
     pub grad_norm: f64,
+    /// The norms of the gradients of the encoder, the decoder and the pose networks, before clipping.
+    #[serde(default)]
+    pub grad_norms: [f64; 3],
+    /// What the networks predict, in figures.
+    #[serde(default, flatten)]
+    pub vitals: Vitals,
 }
 
 /// A model in training.
@@ -48,6 +55,29 @@ pub struct Trainer {
     pub(super) adamw: AdamW<f32>,
     pub(super) average: Option<Average<f32>>,
     ties: TieBreak<f32>,
+    /// The part that each parameter belongs to.
+    parts: Vec<usize>,
+}
+
+/// What a forward pass leaves behind.
+struct Forward {
+    c: Context<f32>,
+    found: Loss<f32>,
+    /// At full size, `[B, H, W, 1]`.
+    disparity: Tensor<f32>,
+    /// Of each source, `[B, 3, 4]`.
+    transforms: Vec<Tensor<f32>>,
+}
+
+/// The part that a parameter belongs to: 0 the encoder, 1 the decoder, 2 the pose networks.
+pub(super) fn part_of(name: &str) -> usize {
+    if name.starts_with("encoder.") {
+        0
+    } else if name.starts_with("depth.") {
+        1
+    } else {
+        2
+    }
 }
 
 /// What the loss compares in a batch.
@@ -74,7 +104,8 @@ impl Trainer {
         adamw.betas = plan.optim.betas;
         let average = (plan.optim.average > 0.0).then(|| Average::new(&params, plan.optim.average));
         let ties = TieBreak::new(plan.loss.tie_break, &mut Random::of(plan.seed, Stream::TiePool));
-        Trainer { model, params, plan, adamw, average, ties }
+        let parts = params.iter().map(|(_, p)| part_of(p.name())).collect();
+        Trainer { model, params, plan, adamw, average, ties, parts }
     }
 
     /// Teaches the pose network known rotations, before the first step; `tell` hears of every step and its error in
@@ -106,8 +137,8 @@ impl Trainer {
         self.average.as_ref().map_or_else(|| self.params.clone(), |a| a.params(&self.params))
     }
 
-    /// The loss of a batch, and the context it was computed in.
-    fn forward(&self, tape: &Tape<f32>, batch: &Batch) -> (Context<f32>, Loss<f32>) {
+    /// The loss of a batch, and what it was computed from.
+    fn forward(&self, tape: &Tape<f32>, batch: &Batch) -> Forward {
         let step = self.adamw.steps;
         let c = Context::training(&self.params, tape, Random::of(self.plan.seed, Stream::Dropout(step)));
         let [prev, target, next] = batch.seen.each_ref().map(|t| Var::constant(t.clone()));
@@ -118,7 +149,9 @@ impl Trainer {
         let config = LossConfig { auto_mask, ..self.plan.loss };
         let found =
             loss(&disparities, &transforms, &views(batch, config.scales), &config, Some((&self.ties, &mut random)));
-        (c, found)
+        let disparity = disparities[0].value().clone();
+        let transforms = transforms.iter().map(|t| t.value().clone()).collect();
+        Forward { c, found, disparity, transforms }
     }
 
     /// One step: forward, backward, AdamW.
@@ -129,7 +162,7 @@ impl Trainer {
     pub fn step(&mut self, batch: &Batch) -> Result<StepReport> {
         let step = self.adamw.steps + 1;
         let tape = Tape::new();
-        let (c, found) = self.forward(&tape, batch);
+        let Forward { c, found, disparity, transforms } = self.forward(&tape, batch);
         let total = found.total.value().item() as f64;
         if !total.is_finite() {
             return Err(self.explain(step, batch));
@@ -143,7 +176,12 @@ impl Trainer {
         // From here on nobody else holds the weights: they are changed in place.
         let moved = c.into_moved();
         let bound = if self.plan.optim.clip > 0.0 { self.plan.optim.clip } else { f64::INFINITY };
-        let grad_norm = profile::phase("norm of the gradients", || clip_norm(&mut gradients, bound));
+        let (grad_norms, grad_norm) = profile::phase("norm of the gradients", || {
+            let parts: [f64; 3] = norms(&gradients, |i| self.parts[i]);
+            let whole = parts.iter().map(|norm| norm * norm).sum::<f64>().sqrt();
+            clip_from(&mut gradients, whole, bound);
+            (parts, whole)
+        });
         if !grad_norm.is_finite() {
             let bad = self.params.iter().zip(&gradients).find(|(_, g)| g.as_ref().is_some_and(|g| !g.is_finite()));
             let name = bad.map_or("of a parameter", |((_, p), _)| p.name());
@@ -155,16 +193,7 @@ impl Trainer {
         let learning_rates =
             [self.plan.optim.encoder_rate, self.plan.optim.rate, self.plan.optim.pose_rate].map(|r| r * factor);
         let decay = self.plan.optim.decay;
-        let group = |name: &str| {
-            let which = if name.starts_with("encoder.") {
-                0
-            } else if name.starts_with("depth.") {
-                1
-            } else {
-                2
-            };
-            Group { learning_rate: learning_rates[which], decay }
-        };
+        let group = |name: &str| Group { learning_rate: learning_rates[part_of(name)], decay };
         if !profile::phase("adamw", || self.adamw.step(&mut self.params, &gradients, group)) {
             self.check_finite()?;
         }
@@ -186,6 +215,11 @@ impl Trainer {
             auto_mask: found.auto_mask,
             learning_rates,
             grad_norm,
+            grad_norms,
+            vitals: profile::phase("vitals", || {
+                let signs = Signs { disparity: &disparity, transforms: &transforms, intrinsics: &batch.intrinsics };
+                Vitals::of(&signs, &self.plan.loss)
+            }),
         };
         profile::phase("freeing", move || drop((all, gradients, objective, found, tape)));
         Ok(report)
