@@ -134,7 +134,7 @@ fn a_training_on_still_frames_is_told_so_once_and_its_folder_says_it() {
     assert!(matches!(ended.expect("trained"), Ended::Interrupted(12)));
     drop(run);
     let mut run = Run::resume(&folder).expect("resumed");
-    run.train(&data, || false, |event| drop(tell(&event))).expect("trained");
+    run.train(&data, || false, |event| _ = tell(&event)).expect("trained");
     assert_eq!(told, [(10, "frames are static")]);
     let text = std::fs::read_to_string(folder.join("warnings.jsonl")).expect("warnings");
     let lines: Vec<serde_json::Value> = text.lines().map(|l| serde_json::from_str(l).expect("a line")).collect();

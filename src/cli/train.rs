@@ -8,6 +8,7 @@ use std::time::Instant;
 use parallax::monovit::{Preset, Setup};
 use parallax::train::cost::check_memory;
 use parallax::train::data::{self, STREET};
+use parallax::train::freeze::frozen;
 use parallax::train::recipe::{RunConfig, STEPS, read_config};
 use parallax::train::run::{Ended, Event, Run, RunData, RunMetrics};
 use parallax::train::start::Start;
@@ -16,6 +17,7 @@ use parallax::{Error, Result};
 
 use super::ablation;
 use super::camera::CameraArgs;
+use super::control::Control;
 use super::progress::Progress;
 
 #[derive(clap::Args)]
@@ -59,7 +61,7 @@ pub struct Args {
     /// Steps between two checkpoints, at which the state is saved and the weights are validated [default: 200].
     #[arg(long, value_name = "N")]
     checkpoint_every: Option<u64>,
-    /// Number of passes over the data, instead of --steps.
+    /// Number of epochs, instead of --steps: passes over the training samples, each rounded up to whole steps.
     #[arg(long, value_name = "N")]
     epochs: Option<u64>,
     /// Learning rate of the depth decoder; those of the encoder and of the pose networks keep their ratio to it
@@ -99,6 +101,8 @@ pub struct Args {
     /// Print `metrics.json` on standard output at the end, and nothing else there.
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    control: Control,
     #[command(flatten)]
     networks: ablation::Networks,
     #[command(flatten)]
@@ -227,13 +231,12 @@ fn create(args: &Args) -> Result<(Run, RunData)> {
             note!("{report}");
         }
     }
+    frozen(&start.params, &config.freeze)?;
     let folder = args.out.clone().unwrap_or_else(|| next_free("runs"));
     let made = !folder.exists();
     Run::claim(&folder)?;
     let prepared = open(&config).and_then(|data| {
-        if let Some(epochs) = args.epochs {
-            config.steps = epochs.saturating_mul(data.train.len().div_ceil(config.batch.max(1)) as u64);
-        }
+        config.set_epoch(data.train.len(), args.epochs);
         Ok((Run::create_from(&folder, config, start)?, data))
     });
     prepared.inspect_err(|_| {
@@ -255,6 +258,7 @@ fn resume(args: &Args, folder: &Path) -> Result<(Run, RunData)> {
             config.steps = steps;
         }
         config.skip_bad_frames |= args.skip_bad_frames;
+        args.control.apply_kept(config);
         Ok(())
     };
     let run = Run::resume_with(folder, change, |warning| note!("warning: {warning}"))?;
@@ -319,7 +323,7 @@ impl Args {
             ("--checkpoint-every", self.checkpoint_every.is_some()),
             ("an ablation", self.networks.any() || self.loss.any()),
         ];
-        match given.into_iter().find(|(_, given)| *given) {
+        match given.into_iter().chain(self.control.fixed()).find(|(_, given)| *given) {
             Some((flag, _)) => {
                 let message = "cannot be changed with --resume: it is part of the run. A new run can start from its \
                                weights with --init RUN";
@@ -384,6 +388,7 @@ fn configuration(args: &Args) -> Result<RunConfig> {
         c.optim.encoder_rate *= factor;
         c.optim.pose_rate *= factor;
     }
+    args.control.apply(&mut c)?;
     Ok(c)
 }
 
@@ -446,6 +451,10 @@ mod tests {
             ("learning_rate", c.optim.rate.to_string()),
             ("seed", c.seed.to_string()),
             ("ssim", c.loss.ssim.to_string()),
+            ("accumulate", c.accumulate.to_string()),
+            ("encoder_rate", c.optim.encoder_rate.to_string()),
+            ("pose_rate", c.optim.pose_rate.to_string()),
+            ("keep", c.keep.to_string()),
         ];
         for (flag, value) in expected {
             let argument = command.get_arguments().find(|a| a.get_id() == flag).unwrap_or_else(|| panic!("--{flag}"));

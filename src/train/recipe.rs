@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::rotations::{RotationPlan, Rotations};
+pub use super::schedule::{RateDecay, RateSchedule};
 use crate::data::batch::Augment;
 use crate::data::camera::Camera;
 use crate::error::{Error, Result};
@@ -15,7 +16,7 @@ use crate::formats::bounded::{MAX_SETTINGS, read_text};
 use crate::monovit::loss::LossConfig;
 use crate::monovit::setup::check_size;
 use crate::monovit::{Ablation, Config, Preset, Setup};
-use crate::optim::{Decay, Schedule};
+use crate::optim::Schedule;
 
 /// Number of steps of the default run.
 pub const STEPS: u64 = 3800;
@@ -48,58 +49,6 @@ pub struct OptimConfig {
     pub schedule: RateSchedule,
 }
 
-/// A factor on the learning rates, in shares of the training's steps.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct RateSchedule {
-    /// The share of the steps over which the rates grow linearly from nothing.
-    pub warm_up: f64,
-    /// Decay after the warm-up.
-    pub decay: RateDecay,
-}
-
-/// Decay of the learning rates, in shares of the training's steps.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case", tag = "kind", deny_unknown_fields)]
-pub enum RateDecay {
-    /// No decay.
-    Constant,
-    /// By `factor`, once, after the share `at` of the steps.
-    Step {
-        /// The share of the steps.
-        at: f64,
-        /// The factor.
-        factor: f64,
-    },
-    /// By `factor` after every share `every` of the steps.
-    Exponential {
-        /// The share of the steps between two falls.
-        every: f64,
-        /// The factor.
-        factor: f64,
-    },
-    /// Along half a cosine wave, down to `end` times the rate at the last step.
-    Cosine {
-        /// The factor at the end.
-        end: f64,
-    },
-}
-
-impl RateSchedule {
-    /// The schedule of a training of so many steps.
-    pub fn over(&self, steps: u64) -> Schedule {
-        let decay = match self.decay {
-            RateDecay::Constant => Decay::Constant,
-            RateDecay::Step { at, factor } => Decay::Step { at: steps_of(at, steps), factor },
-            RateDecay::Exponential { every, factor } => {
-                Decay::Exponential { every: steps_of(every, steps).max(1), factor }
-            }
-            RateDecay::Cosine { end } => Decay::Cosine { steps, end },
-        };
-        Schedule { warm_up: steps_of(self.warm_up, steps), decay }
-    }
-}
-
 impl OptimConfig {
     /// Checks every number.
     ///
@@ -121,24 +70,7 @@ impl OptimConfig {
         check("optim.clip", clip, clip >= 0.0 && clip.is_finite(), "a bound above 0, or 0 for none")?;
         let average = self.average;
         check("optim.average", average, (0.0..1.0).contains(&average), "a number from 0 (for none) to below 1")?;
-        let schedule = self.schedule;
-        check_share("optim.schedule.warm_up", schedule.warm_up)?;
-        let check_factor = |field: &str, factor: f64| {
-            let field = format!("optim.schedule.decay.{field}");
-            check(field, factor, factor >= 0.0 && factor.is_finite(), "a factor from 0")
-        };
-        match schedule.decay {
-            RateDecay::Constant => Ok(()),
-            RateDecay::Step { at, factor } => {
-                check_share("optim.schedule.decay.at", at)?;
-                check_factor("factor", factor)
-            }
-            RateDecay::Exponential { every, factor } => {
-                check_share("optim.schedule.decay.every", every)?;
-                check_factor("factor", factor)
-            }
-            RateDecay::Cosine { end } => check_factor("end", end),
-        }
+        self.schedule.check()
     }
 }
 
@@ -157,11 +89,11 @@ impl Rotations {
     }
 }
 
-fn check(field: impl Into<String>, found: f64, good: bool, expected: &str) -> Result<()> {
+pub(super) fn check(field: impl Into<String>, found: f64, good: bool, expected: &str) -> Result<()> {
     if good { Ok(()) } else { Err(Error::setting(field, format!("{found} is not {expected}"))) }
 }
 
-fn check_share(field: &str, share: f64) -> Result<()> {
+pub(super) fn check_share(field: &str, share: f64) -> Result<()> {
     check(field, share, (0.0..=1.0).contains(&share), "a share of the steps, from 0 to 1")
 }
 
@@ -176,6 +108,8 @@ pub struct Plan {
     pub loss: LossConfig,
     /// The number of steps before auto-masking sets in.
     pub auto_mask_after: u64,
+    /// The number of batches whose gradients a step averages.
+    pub accumulate: usize,
     /// Known rotations for the pose network.
     pub rotations: RotationPlan,
     /// Seed of everything random.
@@ -194,6 +128,8 @@ pub struct RunConfig {
     pub width: usize,
     /// Batch size.
     pub batch: usize,
+    /// Number of batches whose gradients a step averages.
+    pub accumulate: usize,
     /// Number of training steps.
     pub steps: u64,
     /// Seed of everything random.
@@ -230,6 +166,17 @@ pub struct RunConfig {
     pub log_every: u64,
     /// The whole state is written, and the weights are validated, every so many steps.
     pub checkpoint_every: u64,
+    /// Number of states that are kept: the newest, and those before it. From 3 on under their steps, too.
+    pub keep: usize,
+    /// Number of validations in a row without a new best after which training stops; without, it goes to the end.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub patience: Option<u64>,
+    /// Steps of an epoch, which is one pass over the training samples: found when a run is made.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub epoch: Option<u64>,
+    /// Patterns of the names of parameters and running statistics that stay as they are: `encoder.*`.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub freeze: Vec<String>,
     /// The share of the steps before auto-masking sets in. While the motion is not known yet, a warped neighbour
     /// explains hardly any pixel better than an unwarped one, and masking would leave little to learn from.
     pub auto_mask_delay: f64,
@@ -260,6 +207,7 @@ impl RunConfig {
             height: 96,
             width: 320,
             batch: 4,
+            accumulate: 1,
             steps,
             seed: 0,
             data: "street".into(),
@@ -274,6 +222,10 @@ impl RunConfig {
             initial_disparity: Some(0.15),
             log_every: 10,
             checkpoint_every: 200,
+            keep: 2,
+            patience: None,
+            epoch: None,
+            freeze: Vec::new(),
             ablation: Ablation::default(),
             augment: Augment { flip: true, jitter: false },
             // Of the 3,800 steps of the default run these shares are 300, 500 before training and 600, and 100.
@@ -334,11 +286,21 @@ impl RunConfig {
     pub fn plan(&self) -> Plan {
         Plan {
             optim: self.optim,
-            schedule: self.optim.schedule.over(self.steps),
+            schedule: self.optim.schedule.over(self.steps, self.epoch.unwrap_or(self.steps)),
             loss: self.loss,
             auto_mask_after: steps_of(self.auto_mask_delay, self.steps),
+            accumulate: self.accumulate,
             rotations: self.rotations.over(self.steps),
             seed: self.seed,
+        }
+    }
+
+    /// Notes how many steps a pass over so many training samples takes; with `epochs`, so many passes are the training.
+    pub fn set_epoch(&mut self, samples: usize, epochs: Option<u64>) {
+        let epoch = samples.div_ceil(self.batch.saturating_mul(self.accumulate).max(1)) as u64;
+        self.epoch = Some(epoch);
+        if let Some(epochs) = epochs {
+            self.steps = epochs.saturating_mul(epoch);
         }
     }
 
@@ -351,9 +313,13 @@ impl RunConfig {
         check_size("width", self.width)?;
         for (field, number) in [
             ("batch", self.batch as u64),
+            ("accumulate", self.accumulate as u64),
             ("steps", self.steps),
             ("log_every", self.log_every),
             ("checkpoint_every", self.checkpoint_every),
+            ("keep", self.keep as u64),
+            ("patience", self.patience.unwrap_or(1)),
+            ("epoch", self.epoch.unwrap_or(1)),
         ] {
             if number == 0 {
                 return Err(Error::setting(field, "0 is too few: at least 1"));
@@ -443,6 +409,7 @@ mod tests {
     use std::fs::{self, File};
 
     use super::*;
+    use crate::optim::Decay;
 
     fn written(text: &str) -> Result<RunConfig> {
         let place = tempfile::tempdir().unwrap();
@@ -509,6 +476,9 @@ mod tests {
         for (line, text) in [
             ("line 1: steps", "steps = 0"),
             ("line 1: log_every", "log_every = 0"),
+            ("line 1: accumulate", "accumulate = 0"),
+            ("line 1: keep", "keep = 0"),
+            ("line 1: patience", "patience = 0"),
             ("line 2: checkpoint_every", "seed = 1\ncheckpoint_every = 0"),
             ("line 1: auto_mask_delay", "auto_mask_delay = 1.5"),
             ("line 2: optim.clip", "[optim]\nclip = inf"),

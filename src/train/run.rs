@@ -2,7 +2,7 @@
 //!
 //! `RUN/config.toml` (all of it, to run it again), `log.jsonl` (a line a logged step and a validation), `warnings.jsonl` (a
 //! line where a warning of [`health`](super::health) begins or ends), `checkpoints/` (the whole state, and the one before
-//! it), `best.safetensors`, `metrics.json`, `images/`.
+//! it), `best.safetensors` and `last.safetensors`, `metrics.json`, `images/`.
 //!
 //! What is computed is never lost: the state is written before anything is measured, and nothing that only concerns
 //! reporting ends a training.
@@ -22,7 +22,7 @@ use super::state::{self, Notes};
 use super::trainer::{StepReport, Trainer};
 pub use super::validation::{RunMetrics, Validation};
 use crate::data::DataSource;
-use crate::data::batch::{Loader, SkipList};
+use crate::data::batch::{Batch, Loader, SkipList};
 use crate::error::{Error, Result};
 use crate::formats::atomic::{self, check_writable, write_bytes_atomically};
 use crate::formats::safetensors;
@@ -125,8 +125,9 @@ impl Run {
             // Pose networks that somebody trained know rotations already.
             (config.rotations.share, config.rotations.keep) = (0.0, 0.0);
         }
+        let mut trainer = Trainer::of(start.model, start.params, config.plan());
+        trainer.freeze(&config.freeze)?;
         write_config(folder, &config)?;
-        let trainer = Trainer::of(start.model, start.params, config.plan());
         let run = Run {
             folder: folder.to_owned(),
             config,
@@ -167,6 +168,7 @@ impl Run {
             atomic::clean(place);
         }
         let mut trainer = Trainer::new(config.model(), config.plan());
+        trainer.freeze(&config.freeze)?;
         let notes = state::load(&mut trainer, folder, &mut tell)?;
         if config != before {
             write_config(folder, &config)?;
@@ -211,16 +213,17 @@ impl Run {
             self.validate(data, &validation, &mut log, &mut tell)?;
         }
         let (augment, batch, seed) = (self.config.augment, self.config.batch, self.config.seed);
-        let steps = self.trainer.steps();
-        let mut loader = Loader::start(data.train.clone(), augment, batch, seed, steps, self.skip_list())?;
+        let accumulate = self.config.accumulate;
+        let passes = self.trainer.steps() * accumulate as u64;
+        let mut loader = Loader::start(data.train.clone(), augment, batch, seed, passes, self.skip_list())?;
         tell(Event::Phase("training"));
         let (mut since, mut waited, mut counted) = (Instant::now(), 0.0, 0u32);
-        while self.trainer.steps() < self.config.steps {
+        while self.trainer.steps() < self.config.steps && !self.patience_is_over() {
             let asked = Instant::now();
-            let next = loader.next_batch();
-            let report = match next.and_then(|batch| {
+            let next: Result<Vec<Batch>> = (0..accumulate).map(|_| loader.next_batch()).collect();
+            let report = match next.and_then(|batches| {
                 waited += asked.elapsed().as_secs_f64();
-                self.trainer.step(&batch)
+                self.trainer.step_of(&batches)
             }) {
                 Ok(report) => report,
                 Err(error) => {
@@ -257,7 +260,15 @@ impl Run {
             }
         }
         drop(loader);
+        if self.trainer.steps() < self.config.steps {
+            tell(Event::Phase(&format!("stopping: no new best in {} validations", self.notes.since_best)));
+        }
         Ok(Ended::Finished(Box::new(self.finish(data, mean_map, &mut tell)?)))
+    }
+
+    /// Whether validation has found no new best for as long as the configuration waits.
+    fn patience_is_over(&self) -> bool {
+        self.config.patience.is_some_and(|patience| self.notes.since_best >= patience)
     }
 
     /// Whether the state is written after the step that was taken last.
@@ -299,7 +310,7 @@ impl Run {
 
     /// Writes the state; what it holds is checked first.
     pub(super) fn save(&self) -> Result<()> {
-        state::save(&self.trainer, &self.folder, &self.notes)
+        state::save(&self.trainer, &self.folder, &self.notes, self.config.keep)
     }
 
     /// Leaves weights to predict with where no validation has chosen any yet: those that training starts from, or has
@@ -340,6 +351,8 @@ impl Health {
 
 /// The file of the weights that validation chose.
 pub(super) const BEST: &str = "best.safetensors";
+/// The file of the weights that training ended with.
+pub(super) const LAST: &str = "last.safetensors";
 /// The folder of states.
 pub(super) const CHECKPOINTS: &str = "checkpoints";
 const LOCK: &str = ".lock";

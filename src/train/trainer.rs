@@ -1,7 +1,10 @@
 //! One training step, and the state that it moves.
 
+use std::collections::HashMap;
+
 use serde::{Deserialize, Serialize};
 
+use super::freeze::{Frozen, frozen};
 use super::recipe::Plan;
 use super::rotations::Lesson;
 use super::vitals::{Signs, Vitals};
@@ -10,8 +13,8 @@ use crate::error::{Error, Result};
 use crate::monovit::MonoVit;
 use crate::monovit::config::Config;
 use crate::monovit::loss::{Loss, LossConfig, Scales, TieBreak, Views, loss};
-use crate::nn::{Context, Params};
-use crate::optim::{AdamW, Average, Group, clip_from, norms};
+use crate::nn::{Context, Param, ParamId, Params};
+use crate::optim::{AdamW, Average, Group, add, clip_from, norms, scale};
 use crate::random::{Random, Stream};
 use crate::tensor::profile;
 use crate::tensor::{Tape, Tensor, Var};
@@ -45,6 +48,30 @@ pub struct StepReport {
     pub vitals: Vitals,
 }
 
+impl StepReport {
+    /// The means of what batches show; step, rates and gradients stay empty.
+    fn mean(of: &[StepReport]) -> StepReport {
+        let mean = |figure: fn(&StepReport) -> f64| of.iter().map(figure).sum::<f64>() / of.len().max(1) as f64;
+        StepReport {
+            loss: mean(|r| r.loss),
+            photometric: mean(|r| r.photometric),
+            warped: mean(|r| r.warped),
+            unwarped: mean(|r| r.unwarped),
+            smoothness: mean(|r| r.smoothness),
+            auto_mask: mean(|r| r.auto_mask),
+            vitals: Vitals {
+                disparity: mean(|r| r.vitals.disparity),
+                disparity_spread: mean(|r| r.vitals.disparity_spread),
+                saturated: mean(|r| r.vitals.saturated),
+                translation: mean(|r| r.vitals.translation),
+                flow: mean(|r| r.vitals.flow),
+                inside: mean(|r| r.vitals.inside),
+            },
+            ..StepReport::default()
+        }
+    }
+}
+
 /// A model in training.
 pub struct Trainer {
     /// The networks.
@@ -57,6 +84,16 @@ pub struct Trainer {
     ties: TieBreak<f32>,
     /// The part that each parameter belongs to.
     parts: Vec<usize>,
+    frozen: Frozen,
+}
+
+/// What one batch gives to a step.
+struct Pass {
+    gradients: Vec<Option<Tensor<f32>>>,
+    /// Running statistics that it moved.
+    moved: HashMap<ParamId, Tensor<f32>>,
+    /// Its figures, as far as they are those of a batch.
+    report: StepReport,
 }
 
 /// What a forward pass leaves behind.
@@ -105,7 +142,17 @@ impl Trainer {
         let average = (plan.optim.average > 0.0).then(|| Average::new(&params, plan.optim.average));
         let ties = TieBreak::new(plan.loss.tie_break, &mut Random::of(plan.seed, Stream::TiePool));
         let parts = params.iter().map(|(_, p)| part_of(p.name())).collect();
-        Trainer { model, params, plan, adamw, average, ties, parts }
+        Trainer { model, params, plan, adamw, average, ties, parts, frozen: Frozen::default() }
+    }
+
+    /// Leaves the parameters and running statistics alone that patterns name, such as `encoder.*`: they keep their bits,
+    /// and normalisations whose statistics are among them use those.
+    ///
+    /// # Errors
+    /// If a pattern matches nothing, or nothing is left to learn.
+    pub fn freeze(&mut self, patterns: &[String]) -> Result<()> {
+        self.frozen = frozen(&self.params, patterns)?;
+        Ok(())
     }
 
     /// Teaches the pose network known rotations, before the first step; `tell` hears of every step and its error in
@@ -116,7 +163,11 @@ impl Trainer {
         mut tell: impl FnMut(u64, f64) -> bool,
     ) -> Result<bool> {
         let rotations = self.plan.rotations;
-        let mut lesson = Lesson::new(rotations, &self.params, self.plan.seed);
+        let learnt = |(i, (_, p)): (usize, (_, &Param<f32>))| part_of(p.name()) == 2 && p.learnt && !self.frozen[i];
+        if !self.frozen.is_empty() && !self.params.iter().enumerate().any(learnt) {
+            return Ok(true);
+        }
+        let mut lesson = Lesson::new(rotations, &self.params, self.plan.seed).keeping(self.frozen.clone());
         for step in 1..=rotations.steps {
             let error = lesson.step(&self.model, &mut self.params, &next_batch()?);
             if !tell(step, error) {
@@ -138,13 +189,15 @@ impl Trainer {
     }
 
     /// The loss of a batch, and what it was computed from.
-    fn forward(&self, tape: &Tape<f32>, batch: &Batch) -> Forward {
+    /// `pass` (from 0) counts the batches.
+    fn forward(&self, tape: &Tape<f32>, batch: &Batch, pass: u64) -> Forward {
         let step = self.adamw.steps;
-        let c = Context::training(&self.params, tape, Random::of(self.plan.seed, Stream::Dropout(step)));
+        let random = Random::of(self.plan.seed, Stream::Dropout(pass));
+        let c = Context::training_part(&self.params, tape, random, self.frozen.clone());
         let [prev, target, next] = batch.seen.each_ref().map(|t| Var::constant(t.clone()));
         let disparities = self.model.disparities(&c, &target);
         let transforms = self.model.transforms(&c, &prev, &target, &next);
-        let mut random = Random::of(self.plan.seed, Stream::Ties(step));
+        let mut random = Random::of(self.plan.seed, Stream::Ties(pass));
         let auto_mask = self.plan.loss.auto_mask && step >= self.plan.auto_mask_after;
         let config = LossConfig { auto_mask, ..self.plan.loss };
         let found =
@@ -154,80 +207,117 @@ impl Trainer {
         Forward { c, found, disparity, transforms }
     }
 
-    /// One step: forward, backward, AdamW.
+    /// One step on one batch: forward, backward, AdamW.
     ///
     /// # Errors
-    /// If the loss or a gradient is not finite: the step, and the op that first made such a number; nothing is changed.
-    /// If a weight is not finite after the step: its name; that weight is lost.
+    /// As [`step_of`](Trainer::step_of).
     pub fn step(&mut self, batch: &Batch) -> Result<StepReport> {
+        self.step_of(std::slice::from_ref(batch))
+    }
+
+    /// One step on several batches of one size: AdamW with the mean of their gradients, which is that of all their samples
+    /// in one batch, but for normalisations, which see one batch after the other.
+    ///
+    /// # Errors
+    /// If the loss or a gradient is not finite: the step, and the op that first made such a number; no weight is changed.
+    /// If a weight is not finite after the step: its name; that weight is lost.
+    ///
+    /// # Panics
+    /// If there is no batch.
+    pub fn step_of(&mut self, batches: &[Batch]) -> Result<StepReport> {
         let step = self.adamw.steps + 1;
-        let tape = Tape::new();
-        let Forward { c, found, disparity, transforms } = self.forward(&tape, batch);
-        let total = found.total.value().item() as f64;
-        if !total.is_finite() {
-            return Err(self.explain(step, batch));
+        let mut sum: Vec<Option<Tensor<f32>>> = Vec::new();
+        let mut reports = Vec::new();
+        for (i, batch) in batches.iter().enumerate() {
+            let Pass { gradients, moved, report } = self.pass((step - 1) * batches.len() as u64 + i as u64, batch)?;
+            if i == 0 {
+                sum = gradients;
+            } else {
+                profile::phase("sum of gradients", || add(&mut sum, gradients));
+            }
+            reports.push(report);
+            profile::phase("running statistics", || {
+                for (id, value) in moved {
+                    self.params.set(id, value);
+                }
+            });
         }
-        let objective = match self.plan.rotations.term(step - 1, &self.model, &c, batch, self.plan.seed) {
-            Some(term) => &found.total + term,
-            None => found.total.clone(),
-        };
-        let mut all = objective.backward();
-        let mut gradients = c.gradients(&mut all);
-        // From here on nobody else holds the weights: they are changed in place.
-        let moved = c.into_moved();
-        let bound = if self.plan.optim.clip > 0.0 { self.plan.optim.clip } else { f64::INFINITY };
-        let (grad_norms, grad_norm) = profile::phase("norm of the gradients", || {
-            let parts: [f64; 3] = norms(&gradients, |i| self.parts[i]);
-            let whole = parts.iter().map(|norm| norm * norm).sum::<f64>().sqrt();
-            clip_from(&mut gradients, whole, bound);
-            (parts, whole)
-        });
-        if !grad_norm.is_finite() {
-            let bad = self.params.iter().zip(&gradients).find(|(_, g)| g.as_ref().is_some_and(|g| !g.is_finite()));
-            let name = bad.map_or("of a parameter", |((_, p), _)| p.name());
-            return Err(Error::Failed(format!(
-                "step {step}: the gradient of {name} is not finite (the loss is {total})"
-            )));
+        if batches.len() > 1 {
+            scale(&mut sum, 1.0 / batches.len() as f64);
         }
+        let (grad_norms, grad_norm) = self.clip(&mut sum, &reports)?;
         let factor = self.plan.schedule.factor(step);
         let learning_rates =
             [self.plan.optim.encoder_rate, self.plan.optim.rate, self.plan.optim.pose_rate].map(|r| r * factor);
         let decay = self.plan.optim.decay;
         let group = |name: &str| Group { learning_rate: learning_rates[part_of(name)], decay };
-        if !profile::phase("adamw", || self.adamw.step(&mut self.params, &gradients, group)) {
+        if !profile::phase("adamw", || self.adamw.step(&mut self.params, &sum, group)) {
             self.check_finite()?;
         }
-        profile::phase("running statistics", || {
-            for (id, value) in moved {
-                self.params.set(id, value);
-            }
-        });
         if let Some(average) = &mut self.average {
             profile::phase("weight averaging", || average.update(&self.params, step));
         }
+        Ok(StepReport { step, learning_rates, grad_norm, grad_norms, ..StepReport::mean(&reports) })
+    }
+
+    /// Bounds the norm of the gradients; the norms of the parts and of the whole before.
+    fn clip(&self, gradients: &mut [Option<Tensor<f32>>], reports: &[StepReport]) -> Result<([f64; 3], f64)> {
+        let bound = if self.plan.optim.clip > 0.0 { self.plan.optim.clip } else { f64::INFINITY };
+        let (parts, whole) = profile::phase("norm of the gradients", || {
+            let parts: [f64; 3] = norms(gradients, |i| self.parts[i]);
+            let whole = parts.iter().map(|norm| norm * norm).sum::<f64>().sqrt();
+            clip_from(gradients, whole, bound);
+            (parts, whole)
+        });
+        if !whole.is_finite() {
+            let bad = self.params.iter().zip(&*gradients).find(|(_, g)| g.as_ref().is_some_and(|g| !g.is_finite()));
+            let name = bad.map_or("of a parameter", |((_, p), _)| p.name());
+            return Err(Error::Failed(format!(
+                "step {}: the gradient of {name} is not finite (the loss is {})",
+                self.adamw.steps + 1,
+                StepReport::mean(reports).loss
+            )));
+        }
+        Ok((parts, whole))
+    }
+
+    /// Forward and backward for one batch; `pass` (from 0) counts the batches.
+    fn pass(&self, pass: u64, batch: &Batch) -> Result<Pass> {
+        let step = self.adamw.steps;
+        let tape = Tape::new();
+        let Forward { c, found, disparity, transforms } = self.forward(&tape, batch, pass);
+        let total = found.total.value().item() as f64;
+        if !total.is_finite() {
+            return Err(self.explain(step + 1, batch, pass));
+        }
+        let objective = match self.plan.rotations.term([step, pass], &self.model, &c, batch, self.plan.seed) {
+            Some(term) => &found.total + term,
+            None => found.total.clone(),
+        };
+        let mut all = objective.backward();
+        let gradients = c.gradients(&mut all);
+        // From here on nobody else holds the weights: they are changed in place.
+        let moved = c.into_moved();
         let report = StepReport {
-            step,
             loss: total,
             photometric: found.photometric,
             warped: found.warped,
             unwarped: found.unwarped,
             smoothness: found.smoothness,
             auto_mask: found.auto_mask,
-            learning_rates,
-            grad_norm,
-            grad_norms,
             vitals: profile::phase("vitals", || {
                 let signs = Signs { disparity: &disparity, transforms: &transforms, intrinsics: &batch.intrinsics };
                 Vitals::of(&signs, &self.plan.loss)
             }),
+            ..StepReport::default()
         };
-        profile::phase("freeing", move || drop((all, gradients, objective, found, tape)));
-        Ok(report)
+        profile::phase("freeing", move || drop((all, objective, found, disparity, transforms, tape)));
+        Ok(Pass { gradients, moved, report })
     }
 
     /// Runs the forward pass once more, looking at every number.
-    fn explain(&self, step: u64, batch: &Batch) -> Error {
-        let culprit = profile::first_not_finite(|| self.forward(&Tape::new(), batch));
+    fn explain(&self, step: u64, batch: &Batch, pass: u64) -> Error {
+        let culprit = profile::first_not_finite(|| self.forward(&Tape::new(), batch, pass));
         Error::Failed(match culprit {
             Some(culprit) => format!(
                 "step {step}: the loss is not finite; {culprit}. The last good checkpoint is kept: try a smaller learning \
