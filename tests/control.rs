@@ -54,7 +54,9 @@ fn moments(place: &Path, batches: &[[usize; 2]], freeze: &str) -> Vec<(String, V
     trainer.save(&path, Default::default()).expect("written");
     let all = safetensors::read::<f32>(&path).expect("read").tensors;
     let first = all.into_iter().filter(|(name, _)| name.starts_with("first_moment/"));
-    first.map(|(name, tensor)| (name, tensor.data().to_vec())).collect()
+    let mut first: Vec<_> = first.map(|(name, tensor)| (name, tensor.data().to_vec())).collect();
+    first.sort_by(|a, b| a.0.cmp(&b.0));
+    first
 }
 
 /// The greatest difference of gradients, relative to the greatest gradient of the parameter.

@@ -110,6 +110,8 @@ pub struct Plan {
     pub auto_mask_after: u64,
     /// The number of batches whose gradients a step averages.
     pub accumulate: usize,
+    /// The number of steps in which the pose networks learn alone.
+    pub pose_first: u64,
     /// Known rotations for the pose network.
     pub rotations: RotationPlan,
     /// Seed of everything random.
@@ -177,6 +179,11 @@ pub struct RunConfig {
     /// Patterns of the names of parameters and running statistics that stay as they are: `encoder.*`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub freeze: Vec<String>,
+    /// The share of the steps, the first ones, in which the pose networks learn alone. Where weights from elsewhere start, a
+    /// pose network that does not know the new camera's motion yet would bend depths that are right: too long a
+    /// translation pushes what it sees towards the far end.
+    #[serde(default)]
+    pub pose_first: f64,
     /// The share of the steps before auto-masking sets in. While the motion is not known yet, a warped neighbour
     /// explains hardly any pixel better than an unwarped one, and masking would leave little to learn from.
     pub auto_mask_delay: f64,
@@ -226,6 +233,7 @@ impl RunConfig {
             patience: None,
             epoch: None,
             freeze: Vec::new(),
+            pose_first: 0.0,
             ablation: Ablation::default(),
             augment: Augment { flip: true, jitter: false },
             // Of the 3,800 steps of the default run these shares are 300, 500 before training and 600, and 100.
@@ -290,6 +298,7 @@ impl RunConfig {
             loss: self.loss,
             auto_mask_after: steps_of(self.auto_mask_delay, self.steps),
             accumulate: self.accumulate,
+            pose_first: steps_of(self.pose_first, self.steps),
             rotations: self.rotations.over(self.steps),
             seed: self.seed,
         }
@@ -328,6 +337,7 @@ impl RunConfig {
         if self.initial_disparity.is_some_and(|d| d.is_nan() || d <= 0.0 || d >= 1.0) {
             return Err(Error::setting("initial_disparity", "expected a number between 0 and 1"));
         }
+        check_share("pose_first", self.pose_first)?;
         check_share("auto_mask_delay", self.auto_mask_delay)?;
         self.loss.check()?;
         self.rotations.check()?;
@@ -481,6 +491,7 @@ mod tests {
             ("line 1: patience", "patience = 0"),
             ("line 2: checkpoint_every", "seed = 1\ncheckpoint_every = 0"),
             ("line 1: auto_mask_delay", "auto_mask_delay = 1.5"),
+            ("line 1: pose_first", "pose_first = -0.1"),
             ("line 2: optim.clip", "[optim]\nclip = inf"),
             ("line 2: optim.average", "[optim]\naverage = 2.0"),
             ("line 2: optim.rate", "[optim]\nrate = -1e-3"),

@@ -106,14 +106,17 @@ struct Forward {
     transforms: Vec<Tensor<f32>>,
 }
 
+/// The pose networks' part.
+const POSE: usize = 2;
+
 /// The part that a parameter belongs to: 0 the encoder, 1 the decoder, 2 the pose networks.
-pub(super) fn part_of(name: &str) -> usize {
+fn part_of(name: &str) -> usize {
     if name.starts_with("encoder.") {
         0
     } else if name.starts_with("depth.") {
         1
     } else {
-        2
+        POSE
     }
 }
 
@@ -152,7 +155,27 @@ impl Trainer {
     /// If a pattern matches nothing, or nothing is left to learn.
     pub fn freeze(&mut self, patterns: &[String]) -> Result<()> {
         self.frozen = frozen(&self.params, patterns)?;
+        if !self.pose_learns() {
+            self.plan.pose_first = 0;
+        }
         Ok(())
+    }
+
+    /// Whether any parameter of the pose networks is not frozen.
+    fn pose_learns(&self) -> bool {
+        let learns = |(i, (_, p)): (usize, (_, &Param<f32>))| {
+            self.parts[i] == POSE && p.learnt && !self.frozen.get(i).copied().unwrap_or(false)
+        };
+        self.params.iter().enumerate().any(learns)
+    }
+
+    /// What stays as it is in a step (from 0).
+    fn frozen_at(&self, step: u64) -> Frozen {
+        if step >= self.plan.pose_first {
+            return self.frozen.clone();
+        }
+        let frozen = |i: usize| self.frozen.get(i).copied().unwrap_or(false);
+        self.parts.iter().enumerate().map(|(i, &part)| part != POSE || frozen(i)).collect()
     }
 
     /// Teaches the pose network known rotations, before the first step; `tell` hears of every step and its error in
@@ -163,8 +186,7 @@ impl Trainer {
         mut tell: impl FnMut(u64, f64) -> bool,
     ) -> Result<bool> {
         let rotations = self.plan.rotations;
-        let learnt = |(i, (_, p)): (usize, (_, &Param<f32>))| part_of(p.name()) == 2 && p.learnt && !self.frozen[i];
-        if !self.frozen.is_empty() && !self.params.iter().enumerate().any(learnt) {
+        if !self.pose_learns() {
             return Ok(true);
         }
         let mut lesson = Lesson::new(rotations, &self.params, self.plan.seed).keeping(self.frozen.clone());
@@ -193,7 +215,7 @@ impl Trainer {
     fn forward(&self, tape: &Tape<f32>, batch: &Batch, pass: u64) -> Forward {
         let step = self.adamw.steps;
         let random = Random::of(self.plan.seed, Stream::Dropout(pass));
-        let c = Context::training_part(&self.params, tape, random, self.frozen.clone());
+        let c = Context::training_part(&self.params, tape, random, self.frozen_at(step));
         let [prev, target, next] = batch.seen.each_ref().map(|t| Var::constant(t.clone()));
         let disparities = self.model.disparities(&c, &target);
         let transforms = self.model.transforms(&c, &prev, &target, &next);
