@@ -180,9 +180,9 @@ fn a_run_ends_early_if_that_is_asked_for_and_can_be_taken_up_again() {
 
 #[test]
 fn an_epoch_is_a_pass_over_the_samples_in_whole_steps() {
-    let mut config = RunConfig { batch: 2, accumulate: 2, ..config() };
+    let mut config = RunConfig { batch: 2, accumulate: 2, epochs: Some(4), ..config() };
     config.optim.schedule = RateSchedule { warm_up: 0.0, decay: RateDecay::Epochs { factor: 0.5 } };
-    config.set_epoch(9, Some(4));
+    config.set_epoch(9);
     assert_eq!((config.epoch, config.steps), (Some(3), 12));
     let schedule = config.plan().schedule;
     assert_eq!([1, 3, 4, 6, 7, 12].map(|step| schedule.factor(step)), [1.0, 1.0, 0.5, 0.5, 0.25, 0.125]);
@@ -215,4 +215,31 @@ fn flags_that_cannot_be_used_are_refused_before_any_time_is_spent() {
     for flags in [["--accumulate", "2"], ["--schedule", "constant"], ["--freeze", "encoder.*"], ["--pose-rate", "1"]] {
         fails(&[&["train", "--resume", run][..], &flags].concat(), 2, &[flags[0], "--resume"]);
     }
+}
+
+/// The configuration that `train --print-config` prints.
+fn printed(arguments: &[&str]) -> toml::Table {
+    let output =
+        Command::new(env!("CARGO_BIN_EXE_parallax")).args(["train", "--print-config"]).args(arguments).output();
+    let output = output.expect("the program runs");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    toml::from_str(&String::from_utf8_lossy(&output.stdout)).expect("TOML")
+}
+
+#[test]
+fn flags_win_over_the_file_and_that_over_the_recipe_and_that_over_the_preset() {
+    let place = tempfile::tempdir().expect("a folder");
+    let file = place.path().join("part.toml");
+    std::fs::write(&file, "batch = 6\naccumulate = 2\n[optim]\nrate = 3e-4\n").expect("written");
+    let file = file.to_str().expect("a path in UTF-8");
+    let found = printed(&["--recipe", "monovit", "--config", file, "--accumulate", "3", "--schedule", "constant"]);
+    let number = |name: &str| found[name].as_integer().expect("a number");
+    assert_eq!((number("batch"), number("accumulate"), number("height"), number("epochs")), (6, 3, 192, 20));
+    let rates = ["encoder_rate", "rate"].map(|rate| found["optim"][rate].as_float().expect("a rate"));
+    assert_eq!(rates, [5e-5, 3e-4]);
+    assert_eq!(found["optim"]["schedule"]["decay"]["kind"].as_str(), Some("constant"));
+    assert_eq!(number("checkpoint_every"), RunConfig::usual().checkpoint_every as i64);
+    assert!(!printed(&["--recipe", "monodepth2", "--steps", "9"]).contains_key("epochs"));
+    fails(&["train", "--recipe", "monodepth", "--print-config"], 2, &["--recipe", "monodepth", "monovit, monodepth2"]);
+    fails(&["train", "--recipe", "monovit", "--resume", "run"], 2, &["--resume"]);
 }

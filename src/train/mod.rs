@@ -4,8 +4,10 @@ pub mod cost;
 pub mod data;
 pub mod freeze;
 pub mod health;
+pub mod layers;
 mod log;
 pub mod recipe;
+mod recipes;
 pub mod rotations;
 pub mod run;
 pub mod schedule;
@@ -41,7 +43,7 @@ pub fn train(mut config: RunConfig, folder: &Path, tell: impl FnMut(Event)) -> R
     cost::check_memory(&config)?;
     Run::claim(folder)?;
     let data = data::open(&config, &|_, _, _| ())?;
-    config.set_epoch(data.train.len(), None);
+    config.set_epoch(data.train.len());
     match Run::create(folder, config)?.train(&data, || false, tell)? {
         Ended::Finished(metrics) => Ok(*metrics),
         Ended::Interrupted(step) => Err(Error::Failed(format!("stopped after step {step}"))),

@@ -3,16 +3,16 @@
 //! What belongs to the beginning of a training (warm-up, rotations, the delay of auto-masking) is a share of its steps,
 //! so that a recipe can be given another number of steps. [`RunConfig::plan`] turns the shares into steps.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+pub use super::layers::read_config;
 use super::rotations::{RotationPlan, Rotations};
 pub use super::schedule::{RateDecay, RateSchedule};
 use crate::data::batch::Augment;
 use crate::data::camera::Camera;
 use crate::error::{Error, Result};
-use crate::formats::bounded::{MAX_SETTINGS, read_text};
 use crate::monovit::loss::LossConfig;
 use crate::monovit::setup::check_size;
 use crate::monovit::{Ablation, Config, Preset, Setup};
@@ -134,6 +134,10 @@ pub struct RunConfig {
     pub accumulate: usize,
     /// Number of training steps.
     pub steps: u64,
+    /// Number of epochs, where that is how the steps are counted: passes over the training samples. The steps follow from it
+    /// when a run is made.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub epochs: Option<u64>,
     /// Seed of everything random.
     pub seed: u64,
     /// `street`, or a folder: in the layout of KITTI raw, or of frames ([`data::frames`](crate::data::frames)).
@@ -216,6 +220,7 @@ impl RunConfig {
             batch: 4,
             accumulate: 1,
             steps,
+            epochs: None,
             seed: 0,
             data: "street".into(),
             split: None,
@@ -304,11 +309,12 @@ impl RunConfig {
         }
     }
 
-    /// Notes how many steps a pass over so many training samples takes; with `epochs`, so many passes are the training.
-    pub fn set_epoch(&mut self, samples: usize, epochs: Option<u64>) {
+    /// Notes how many steps a pass over so many training samples takes, and how many steps the epochs are, if those are what
+    /// counts.
+    pub fn set_epoch(&mut self, samples: usize) {
         let epoch = samples.div_ceil(self.batch.saturating_mul(self.accumulate).max(1)) as u64;
         self.epoch = Some(epoch);
-        if let Some(epochs) = epochs {
+        if let Some(epochs) = self.epochs {
             self.steps = epochs.saturating_mul(epoch);
         }
     }
@@ -329,6 +335,7 @@ impl RunConfig {
             ("keep", self.keep as u64),
             ("patience", self.patience.unwrap_or(1)),
             ("epoch", self.epoch.unwrap_or(1)),
+            ("epochs", self.epochs.unwrap_or(1)),
         ] {
             if number == 0 {
                 return Err(Error::setting(field, "0 is too few: at least 1"));
@@ -361,62 +368,10 @@ fn none_one_or_many<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result
     })
 }
 
-/// Reads a configuration: a run's `config.toml`, or part of one; what it does not say is as in [`RunConfig::new`] of
-/// its preset.
-///
-/// # Errors
-/// Names the file, and the line where a value cannot be used.
-pub fn read_config(path: &Path) -> Result<RunConfig> {
-    let text = read_text(path, MAX_SETTINGS, "a configuration")?;
-    let wrong = |e: toml::de::Error| Error::file(path, e.to_string());
-    let said: toml::Table = toml::from_str(&text).map_err(wrong)?;
-    let preset = said.get("preset").cloned().map_or(Ok(Preset::Nano), toml::Value::try_into).map_err(wrong)?;
-    let usual = toml::Table::try_from(RunConfig::new(preset, STEPS));
-    let mut whole = usual.map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
-    fill(&mut whole, said);
-    let config: RunConfig = whole.try_into().map_err(wrong)?;
-    config.check().map_err(|error| match error {
-        Error::Setting { name, message } => {
-            let place = line_of(&text, &name).map_or(String::new(), |line| format!("line {line}: "));
-            Error::file(path, format!("{place}{name}: {message}"))
-        }
-        other => other,
-    })?;
-    Ok(config)
-}
-
-/// Puts what was said over the defaults, table by table. A choice (`kind`) with what belongs to it is one thing.
-fn fill(defaults: &mut toml::Table, said: toml::Table) {
-    for (key, value) in said {
-        match (defaults.get_mut(&key), value) {
-            (Some(toml::Value::Table(below)), toml::Value::Table(said)) if !said.contains_key("kind") => {
-                fill(below, said);
-            }
-            (_, value) => {
-                defaults.insert(key, value);
-            }
-        }
-    }
-}
-
-/// The line of a TOML text, from 1, that sets a field such as `optim.clip`.
-fn line_of(text: &str, field: &str) -> Option<usize> {
-    let (table, key) = field.rsplit_once('.').unwrap_or(("", field));
-    let mut within = "";
-    for (i, line) in text.lines().enumerate() {
-        let line = line.trim();
-        if let Some(name) = line.strip_prefix('[').and_then(|rest| rest.strip_suffix(']')) {
-            within = name.trim();
-        } else if within == table && line.split('=').next().is_some_and(|name| name.trim() == key) {
-            return Some(i + 1);
-        }
-    }
-    None
-}
-
 #[cfg(test)]
 mod tests {
     use std::fs::{self, File};
+    use std::path::Path;
 
     use super::*;
     use crate::optim::Decay;
