@@ -123,6 +123,30 @@ fn frozen_parameters_and_statistics_keep_their_bits_and_others_do_not() {
     assert!(kept > 100 && moved > 20, "{kept} kept, {moved} moved");
 }
 
+#[test]
+fn pose_networks_that_learn_first_leave_depth_alone_meanwhile() {
+    let config = RunConfig { steps: 4, pose_first: 0.5, ..config() };
+    let (model, start) = MonoVit::new(config.model(), 0);
+    let mut trainer = Trainer::of(model, start.clone(), config.plan());
+    let street = street(1);
+    let mut step = |i: u64| {
+        let batch = batch_of_step(street.as_ref(), config.augment, 2, 0, i).expect("a batch");
+        let report = trainer.step(&batch).expect("a step");
+        let moved = |prefix: &str| {
+            let pairs = start.iter().zip(trainer.params.iter());
+            pairs.filter(|((_, a), (_, b))| a.name().starts_with(prefix) && !a.value.same_bits(&b.value)).count()
+        };
+        (["encoder.", "depth.", "pose"].map(moved), report.grad_norms)
+    };
+    for i in 0..2 {
+        let (moved, norms) = step(i);
+        assert!(moved[0] == 0 && moved[1] == 0 && moved[2] > 20, "{moved:?}");
+        assert!(norms[0] == 0.0 && norms[1] == 0.0 && norms[2] > 0.0, "{norms:?}");
+    }
+    let (moved, norms) = step(2);
+    assert!(moved.iter().all(|&n| n > 20) && norms.iter().all(|&n| n > 0.0), "{moved:?} {norms:?}");
+}
+
 /// The names of the states of a run.
 fn states(folder: &Path) -> Vec<String> {
     let files = std::fs::read_dir(folder.join("checkpoints")).expect("states").flatten();

@@ -14,7 +14,7 @@ pub struct Control {
     /// Learning rate of the depth encoder [default: 0.001, or 0.00005 where training starts from weights].
     #[arg(long, value_name = "RATE")]
     encoder_rate: Option<f64>,
-    /// Learning rate of the pose networks [default: 0.0028, or 0.0001 where training starts from weights].
+    /// Learning rate of the pose networks [default: 0.0028; 0.001 with --init, 0.0001 with --init-encoder].
     #[arg(long, value_name = "RATE")]
     pose_rate: Option<f64>,
     /// Schedule of the rates after the warm-up: constant; step:FACTOR@SHARE (once, after a share of the steps);

@@ -258,8 +258,12 @@ impl RunConfig {
         }
     }
 
-    /// The recipe for a start from trained weights: the published learning rates (MonoViT, section 4.1), pictures of
-    /// the weights' own size, and nothing of what random weights need.
+    /// The recipe for a start from trained weights: the published learning rates of depth (MonoViT, section 4.1), pictures
+    /// of the weights' own size, and nothing of what random weights need.
+    ///
+    /// The pose networks learn faster, and alone at first. They know the motion of another camera: where that moved three
+    /// times as far between two frames, depths of three times the distance explain the new pictures, and depth gets there
+    /// long before a pose network does whose output is scaled by 0.01.
     pub fn from_weights(setup: Setup, steps: u64) -> Self {
         let Setup { preset, ablation, height, width, min_depth, max_depth } = setup;
         let scratch = Self::new(preset, steps);
@@ -271,7 +275,8 @@ impl RunConfig {
             auto_mask_delay: 0.0,
             loss: LossConfig { min_depth, max_depth, ..scratch.loss },
             rotations: Rotations::default(),
-            optim: OptimConfig { encoder_rate: 5e-5, rate: 1e-4, pose_rate: 1e-4, ..scratch.optim },
+            pose_first: 0.3,
+            optim: OptimConfig { encoder_rate: 5e-5, rate: 1e-4, pose_rate: 1e-3, ..scratch.optim },
             ..scratch
         }
     }
@@ -419,6 +424,15 @@ mod tests {
         let step = written("[optim.schedule.decay]\nkind = \"step\"\nat = 0.75\nfactor = 0.1").unwrap();
         assert_eq!(step.optim.schedule.decay, RateDecay::Step { at: 0.75, factor: 0.1 });
         assert_eq!(written("").unwrap(), RunConfig::usual());
+    }
+
+    #[test]
+    fn from_trained_weights_the_pose_networks_learn_first_and_depth_at_the_published_rates() {
+        let config = RunConfig::from_weights(Setup::of(Preset::Nano), 300);
+        assert_eq!((config.plan().pose_first, config.plan().rotations.steps), (90, 0));
+        let optim = config.optim;
+        assert!(optim.encoder_rate == 5e-5 && optim.rate == 1e-4 && optim.pose_rate > optim.rate);
+        assert_eq!(RunConfig::usual().plan().pose_first, 0);
     }
 
     #[test]
