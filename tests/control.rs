@@ -38,8 +38,11 @@ fn finish(run: &mut Run, data: &RunData) -> u64 {
     metrics.steps
 }
 
+/// A parameter's name, and numbers.
+type Named = (String, Vec<f32>);
+
 /// The optimiser's first moments after one step, a tenth of the gradients.
-fn moments(place: &Path, batches: &[[usize; 2]], freeze: &str) -> Vec<(String, Vec<f32>)> {
+fn moments(place: &Path, batches: &[[usize; 2]], freeze: &str) -> Vec<Named> {
     let mut config = config();
     (config.loss.tie_break, config.auto_mask_delay) = (0.0, 0.0);
     let (model, params) = MonoVit::new(config.model(), 0);
@@ -60,9 +63,9 @@ fn moments(place: &Path, batches: &[[usize; 2]], freeze: &str) -> Vec<(String, V
 }
 
 /// The greatest difference of gradients, relative to the greatest gradient of the parameter.
-fn difference(a: &[(String, Vec<f32>)], b: &[(String, Vec<f32>)]) -> f32 {
+fn difference(a: &[Named], b: &[Named]) -> f32 {
     assert!(a.len() == b.len() && a.len() > 50);
-    let of = |((name, a), (other, b)): (&(String, Vec<f32>), &(String, Vec<f32>))| {
+    let of = |((name, a), (other, b)): (&Named, &Named)| {
         assert_eq!(name, other);
         let largest = a.iter().fold(1e-6f32, |m, x| m.max(x.abs()));
         a.iter().zip(b).fold(0f32, |m, (x, y)| m.max((x - y).abs() / largest))
