@@ -92,6 +92,56 @@ fn a_resumed_run_ends_like_one_that_never_stopped() {
     }
 }
 
+/// A street where nothing moves: every neighbour is the frame itself.
+struct Still(Arc<dyn DataSource>);
+
+impl DataSource for Still {
+    fn len(&self) -> usize {
+        self.0.len()
+    }
+    fn name(&self, sample: usize) -> String {
+        format!("still frame {sample}")
+    }
+    fn image(&self, sample: usize, _: i32) -> parallax::Result<Arc<image::RgbImage>> {
+        self.0.image(sample, 0)
+    }
+    fn intrinsics(&self, sample: usize) -> Intrinsics {
+        self.0.intrinsics(sample)
+    }
+    fn depth(&self, sample: usize) -> parallax::Result<Option<DepthMap>> {
+        self.0.depth(sample)
+    }
+}
+
+#[test]
+fn a_training_on_still_frames_is_told_so_once_and_its_folder_says_it() {
+    let place = tempfile::tempdir().expect("a folder");
+    let folder = place.path().join("run");
+    let still = || Arc::new(Still(street(1)));
+    let data = RunData { train: still(), validation: still(), test: None };
+    let config = RunConfig { steps: 14, checkpoint_every: 14, rotations: Rotations::default(), ..config() };
+    let mut told = Vec::new();
+    let mut tell = |event: &Event| {
+        if let Event::Health(warning) = event {
+            told.push((warning.step, warning.warning));
+        }
+        matches!(event, Event::Step(r) if r.step == 12)
+    };
+    // Interrupted after the warning has begun, and continued: it is not told again.
+    let stopping = std::cell::Cell::new(false);
+    let mut run = Run::create(&folder, config).expect("a run");
+    let ended = run.train(&data, || stopping.get(), |event| stopping.set(stopping.get() || tell(&event)));
+    assert!(matches!(ended.expect("trained"), Ended::Interrupted(12)));
+    drop(run);
+    let mut run = Run::resume(&folder).expect("resumed");
+    run.train(&data, || false, |event| _ = tell(&event)).expect("trained");
+    assert_eq!(told, [(10, "frames are static")]);
+    let text = std::fs::read_to_string(folder.join("warnings.jsonl")).expect("warnings");
+    let lines: Vec<serde_json::Value> = text.lines().map(|l| serde_json::from_str(l).expect("a line")).collect();
+    assert!(lines.len() == 1 && lines[0]["warning"] == "frames are static" && lines[0]["begins"] == true, "{text}");
+    assert!(log(&folder).iter().any(|l| l["unwarped"] == 0.0 && l["inside"].is_f64() && l["grad_norms"].is_array()));
+}
+
 /// A street of which only some frames have depth, and which may have lost a picture.
 struct Patchy {
     street: Arc<dyn DataSource>,

@@ -14,6 +14,7 @@ mod ablation;
 mod attention;
 mod bench;
 mod camera;
+mod control;
 mod convert;
 mod data;
 mod eval;

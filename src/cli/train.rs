@@ -8,7 +8,9 @@ use std::time::Instant;
 use parallax::monovit::{Preset, Setup};
 use parallax::train::cost::check_memory;
 use parallax::train::data::{self, STREET};
-use parallax::train::recipe::{RunConfig, STEPS, read_config};
+use parallax::train::freeze::frozen;
+use parallax::train::layers::Layers;
+use parallax::train::recipe::{RunConfig, STEPS};
 use parallax::train::run::{Ended, Event, Run, RunData, RunMetrics};
 use parallax::train::start::Start;
 use parallax::weights::{self, preset_of};
@@ -16,6 +18,7 @@ use parallax::{Error, Result};
 
 use super::ablation;
 use super::camera::CameraArgs;
+use super::control::Control;
 use super::progress::Progress;
 use super::stereo::StereoArgs;
 
@@ -63,7 +66,7 @@ pub struct Args {
     /// Steps between two checkpoints, at which the state is saved and the weights are validated [default: 200].
     #[arg(long, value_name = "N")]
     checkpoint_every: Option<u64>,
-    /// Number of passes over the data, instead of --steps.
+    /// Number of epochs, instead of --steps: passes over the training samples, each rounded up to whole steps.
     #[arg(long, value_name = "N")]
     epochs: Option<u64>,
     /// Learning rate of the depth decoder; those of the encoder and of the pose networks keep their ratio to it
@@ -73,8 +76,15 @@ pub struct Args {
     /// Seed of everything random [default: 0].
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
-    /// Configuration, such as a run's config.toml, whole or in part. Flags win over it; it wins over the recipe for
-    /// weights to start from.
+    /// Published training, by name: monovit or monodepth2. Flags and --config win over it; it wins over the defaults of the
+    /// preset and of weights to start from [default: this program's own].
+    #[arg(long, value_name = "NAME")]
+    recipe: Option<String>,
+    /// Print the configuration that all this amounts to, as TOML, and do nothing else.
+    #[arg(long, conflicts_with_all = ["resume", "json"])]
+    print_config: bool,
+    /// Configuration, such as a run's config.toml, whole or in part. Flags win over it; it wins over a recipe and the
+    /// defaults for weights to start from.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Weights of all four networks to start from: a run, a file, or a folder with encoder.pth, depth.pth, ...; several
@@ -95,7 +105,7 @@ pub struct Args {
     #[arg(long)]
     skip_bad_frames: bool,
     /// Continue this run: an interrupted one, or with --steps a finished one.
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "config", "init", "init_encoder", "init_pose", "split", "preset"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "config", "recipe", "init", "init_encoder", "init_pose", "split", "preset"])]
     resume: Option<PathBuf>,
     /// Folder of the run, new or empty [default: the first of runs/1, runs/2, ... that does not exist].
     #[arg(long, value_name = "RUN")]
@@ -106,12 +116,21 @@ pub struct Args {
     #[command(flatten)]
     stereo: StereoArgs,
     #[command(flatten)]
+    control: Control,
+    #[command(flatten)]
     networks: ablation::Networks,
     #[command(flatten)]
     loss: ablation::Loss,
 }
 
 pub fn run(args: Args) -> Result<()> {
+    if args.print_config {
+        let config = configuration(&args)?;
+        config.check()?;
+        let text = toml::to_string(&config).map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
+        say!("{}", text.trim_end());
+        return Ok(());
+    }
     let stop = catch_stop()?;
     let (mut run, data) = match &args.resume {
         Some(folder) => resume(&args, folder)?,
@@ -214,6 +233,7 @@ fn show(event: &Event, progress: &mut Progress, stop: &Stop) {
                 v.validated, v.photometric, v.warped, v.unwarped
             ));
         }
+        Event::Health(warning) => progress.say(&format!("warning: {}", warning.message)),
         Event::Warning(what) => progress.say(&format!("warning: {what}")),
     }
 }
@@ -232,13 +252,12 @@ fn create(args: &Args) -> Result<(Run, RunData)> {
             note!("{report}");
         }
     }
+    frozen(&start.params, &config.freeze)?;
     let folder = args.out.clone().unwrap_or_else(|| next_free("runs"));
     let made = !folder.exists();
     Run::claim(&folder)?;
     let prepared = open(&config).and_then(|data| {
-        if let Some(epochs) = args.epochs {
-            config.steps = epochs.saturating_mul(data.train.len().div_ceil(config.batch.max(1)) as u64);
-        }
+        config.set_epoch(data.train.len());
         Ok((Run::create_from(&folder, config, start)?, data))
     });
     prepared.inspect_err(|_| {
@@ -257,10 +276,11 @@ fn resume(args: &Args, folder: &Path) -> Result<(Run, RunData)> {
             config.data = absolute(data);
         }
         if let Some(steps) = args.steps {
-            config.steps = steps;
+            (config.steps, config.epochs) = (steps, None);
         }
         config.skip_bad_frames |= args.skip_bad_frames;
         config.recompute |= args.recompute;
+        args.control.apply_kept(config);
         Ok(())
     };
     let run = Run::resume_with(folder, change, |warning| note!("warning: {warning}"))?;
@@ -326,7 +346,7 @@ impl Args {
             ("--sources or --baseline", self.stereo.any()),
             ("an ablation", self.networks.any() || self.loss.any()),
         ];
-        match given.into_iter().find(|(_, given)| *given) {
+        match given.into_iter().chain(self.control.fixed()).find(|(_, given)| *given) {
             Some((flag, _)) => {
                 let message = "cannot be changed with --resume: it is part of the run. A new run can start from its \
                                weights with --init RUN";
@@ -346,20 +366,25 @@ fn absolute(data: &str) -> String {
 }
 
 fn configuration(args: &Args) -> Result<RunConfig> {
-    let mut c = match &args.config {
-        Some(path) => read_config(path)?,
-        None if !args.init.is_empty() => {
-            // Where weights do not say it the preset does; whether they fit it is found out when they are read.
-            let setup = weights::setup_of(&args.init).or_else(|e| args.preset.map(Setup::of).ok_or(e))?;
-            RunConfig::from_weights(setup, STEPS)
-        }
-        None if args.init_encoder.is_some() => RunConfig::from_encoder(preset(args)?, STEPS),
-        None => RunConfig::new(preset(args)?, STEPS),
+    let layers = Layers::read(args.recipe.as_deref(), args.config.as_deref())?;
+    let said = args.preset.map_or_else(|| layers.preset(), |preset| Ok(Some(preset)))?;
+    let defaults = if !args.init.is_empty() {
+        // Where weights do not say it the preset does; whether they fit it is found out when they are read.
+        let setup = weights::setup_of(&args.init).or_else(|e| said.map(Setup::of).ok_or(e))?;
+        RunConfig::from_weights(setup, STEPS)
+    } else if args.init_encoder.is_some() {
+        RunConfig::from_encoder(preset(args, said)?, STEPS)
+    } else {
+        RunConfig::new(preset(args, said)?, STEPS)
     };
+    let mut c = layers.over(&defaults)?;
     macro_rules! take {
         ($($field:ident),*) => {$(if let Some(value) = args.$field.clone() { c.$field = value; })*};
     }
     take!(data, preset, height, width, batch, seed, steps, log_every, checkpoint_every);
+    if args.epochs.is_some() || args.steps.is_some() {
+        c.epochs = args.epochs;
+    }
     c.data = absolute(&c.data);
     for (to, from) in [
         (&mut c.split, &args.split),
@@ -393,16 +418,16 @@ fn configuration(args: &Args) -> Result<RunConfig> {
         c.optim.encoder_rate *= factor;
         c.optim.pose_rate *= factor;
     }
+    args.control.apply(&mut c)?;
     Ok(c)
 }
 
-/// The preset that was asked for; without, that of the weights to start from; without those, the reduced one.
-fn preset(args: &Args) -> Result<Preset> {
-    let files: Vec<PathBuf> = args.init.iter().chain(&args.init_encoder).cloned().collect();
-    match args.preset {
-        Some(preset) => Ok(preset),
-        None if files.is_empty() => Ok(Preset::Nano),
-        None => preset_of(&files),
+/// The preset that was asked for; without, that of the encoder to start from; without one, the reduced one.
+fn preset(args: &Args, said: Option<Preset>) -> Result<Preset> {
+    match (said, &args.init_encoder) {
+        (Some(preset), _) => Ok(preset),
+        (None, None) => Ok(Preset::Nano),
+        (None, Some(file)) => preset_of(std::slice::from_ref(file)),
     }
 }
 
@@ -455,6 +480,10 @@ mod tests {
             ("learning_rate", c.optim.rate.to_string()),
             ("seed", c.seed.to_string()),
             ("ssim", c.loss.ssim.to_string()),
+            ("accumulate", c.accumulate.to_string()),
+            ("encoder_rate", c.optim.encoder_rate.to_string()),
+            ("pose_rate", c.optim.pose_rate.to_string()),
+            ("keep", c.keep.to_string()),
         ];
         for (flag, value) in expected {
             let argument = command.get_arguments().find(|a| a.get_id() == flag).unwrap_or_else(|| panic!("--{flag}"));

@@ -41,14 +41,28 @@ pub struct Context<T: Float> {
     differentiated: Cell<bool>,
     /// Whether parts that offer it run once more in the backward pass instead of keeping what they computed.
     recomputing: bool,
+    /// The parameters and statistics that stay as they are, by index; empty for none.
+    frozen: Arc<[bool]>,
 }
 
 impl<T: Float> Context<T> {
     /// Training: parameters are leaves of `tape`, normalisation uses and moves batch statistics.
     pub fn training(params: &Params<T>, tape: &Tape<T>, random: Random) -> Self {
-        let var = |p: &super::Param<T>| if p.learnt { tape.leaf(p.value.clone()) } else { p.value.clone().into() };
-        let vars = profile::phase("parameters to leaves", || params.iter().map(|(_, p)| var(p)).collect());
-        Self::with(params, vars, Mode::Training, random)
+        Self::training_part(params, tape, random, Arc::default())
+    }
+
+    /// Training of a part: parameters that are `frozen` (by their order in `params`) are constants without a gradient, and
+    /// normalisations whose statistics are frozen use those, as in inference, and do not move them. What has no entry is
+    /// not frozen.
+    pub fn training_part(params: &Params<T>, tape: &Tape<T>, random: Random, frozen: Arc<[bool]>) -> Self {
+        let constant = |i: usize| frozen.get(i).copied().unwrap_or(false);
+        let var = |(i, (_, p)): (usize, (ParamId, &super::Param<T>))| {
+            if p.learnt && !constant(i) { tape.leaf(p.value.clone()) } else { p.value.clone().into() }
+        };
+        let vars = profile::phase("parameters to leaves", || params.iter().enumerate().map(var).collect());
+        let mut context = Self::with(params, vars, Mode::Training, random);
+        context.frozen = frozen;
+        context
     }
 
     /// Inference: nothing is recorded, normalisation uses running statistics.
@@ -83,6 +97,7 @@ impl<T: Float> Context<T> {
             seen: None,
             differentiated: Cell::new(false),
             recomputing: false,
+            frozen: Arc::default(),
         }
     }
 
@@ -103,6 +118,7 @@ impl<T: Float> Context<T> {
             return f(self, x);
         }
         let (identities, mode, precision) = (self.identities.clone(), self.mode, self.precision);
+        let frozen = self.frozen.clone();
         let (dice, moved) = (self.random.borrow().clone(), self.moved.borrow().clone());
         // Where the first run leaves its dice and statistics; when it runs again nobody asks.
         let left = Rc::new(RefCell::new(None));
@@ -118,6 +134,7 @@ impl<T: Float> Context<T> {
                 seen: None,
                 differentiated: Cell::new(false),
                 recomputing: false,
+                frozen: frozen.clone(),
             };
             let y = f(&inner, &v[0]);
             if let Some(leave) = leave.upgrade() {
@@ -169,6 +186,11 @@ impl<T: Float> Context<T> {
     /// Whether this is training.
     pub fn is_training(&self) -> bool {
         self.mode == Mode::Training
+    }
+
+    /// Whether a parameter or running statistic stays as it is in this pass.
+    pub fn is_frozen(&self, id: ParamId) -> bool {
+        self.frozen.get(id.index()).copied().unwrap_or(false)
     }
 
     /// Whether normalisations are folded into the convolutions in front of them.

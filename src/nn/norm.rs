@@ -7,7 +7,7 @@ use crate::tensor::{Float, Tensor, Var};
 /// Batch normalisation (Ioffe and Szegedy, 1502.03167) over all but the channels, with an activation behind it.
 ///
 /// Training uses the batch's mean and biased variance, and moves the running ones by a tenth (the unbiased variance);
-/// evaluation uses the running ones.
+/// evaluation, and training with frozen statistics ([`Context::training_part`]), uses the running ones.
 #[derive(Clone, Debug)]
 pub struct BatchNorm {
     pub(super) weight: ParamId,
@@ -38,7 +38,7 @@ impl BatchNorm {
     #[track_caller]
     pub fn forward<T: Float>(&self, c: &Context<T>, x: &Var<T>) -> Var<T> {
         let (weight, bias) = (c.var(self.weight), c.var(self.bias));
-        if !c.is_training() {
+        if !c.is_training() || c.is_frozen(self.running_mean) {
             let (mean, var) = (c.var(self.running_mean), c.var(self.running_var));
             return x.batch_norm_eval(weight, bias, mean, var, Self::EPS, self.activation);
         }

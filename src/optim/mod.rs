@@ -7,5 +7,5 @@ mod schedule;
 
 pub use adamw::{AdamW, Group};
 pub use average::Average;
-pub use clip::{clip_norm, norm};
+pub use clip::{add, clip_from, clip_norm, norm, norms, scale};
 pub use schedule::{Decay, Schedule};

@@ -1,4 +1,5 @@
-//! The log of a run: a line of JSON for each logged step, and one for each validation.
+//! The logs of a run, lines of JSON: `log.jsonl` has one for each logged step and for each validation, `warnings.jsonl`
+//! one for each warning that begins or ends.
 
 use std::fs::{File, OpenOptions};
 use std::io::Write;
@@ -6,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
+use super::trainer::StepReport;
 use crate::error::{Error, Result};
 use crate::formats::atomic::write_bytes_atomically;
 use crate::formats::bounded::read_text;
@@ -13,15 +15,21 @@ use crate::formats::bounded::read_text;
 /// Some million lines.
 const MAX_LOG: u64 = 1 << 30;
 
-/// `log.jsonl`, open at its end.
+/// The file of steps and validations.
+pub(super) const LOG: &str = "log.jsonl";
+/// The file of warnings.
+pub(super) const WARNINGS: &str = "warnings.jsonl";
+
+/// A log, open at its end.
 pub(super) struct Log {
     path: PathBuf,
     file: File,
 }
 
 impl Log {
-    pub(super) fn open(folder: &Path) -> Result<Self> {
-        let path = folder.join("log.jsonl");
+    /// Opens a file of a run's folder, which is made if it is missing.
+    pub(super) fn open(folder: &Path, name: &str) -> Result<Self> {
+        let path = folder.join(name);
         let file = OpenOptions::new().create(true).append(true).open(&path).map_err(|e| Error::io(&path, e))?;
         Ok(Log { path, file })
     }
@@ -35,17 +43,35 @@ impl Log {
 
 /// Removes the lines of steps and validations after those that are known to be done: they will be logged again.
 pub(super) fn forget_after(folder: &Path, steps: u64, validated: u64) -> Result<()> {
-    let path = folder.join("log.jsonl");
+    for name in [LOG, WARNINGS] {
+        let path = folder.join(name);
+        if !path.exists() {
+            continue;
+        }
+        let text = read_text(&path, MAX_LOG, "the log of a run")?;
+        let keep = |line: &&str| {
+            // A torn last line is none.
+            let Ok(line) = serde_json::from_str::<serde_json::Value>(line) else { return false };
+            let number = |field: &str| line[field].as_u64();
+            number("step").is_some_and(|s| s <= steps) || number("validated").is_some_and(|s| s <= validated)
+        };
+        let kept: String = text.lines().filter(keep).flat_map(|l| [l, "\n"]).collect();
+        write_bytes_atomically(&path, kept.as_bytes())?;
+    }
+    Ok(())
+}
+
+/// What a run's log says of its steps, oldest first. Lines from before they had all of today's figures are left out.
+pub(super) fn steps(folder: &Path) -> Result<Vec<StepReport>> {
+    let path = folder.join(LOG);
     if !path.exists() {
-        return Ok(());
+        return Ok(Vec::new());
     }
     let text = read_text(&path, MAX_LOG, "the log of a run")?;
-    let keep = |line: &&str| {
-        // A torn last line is none.
-        let Ok(line) = serde_json::from_str::<serde_json::Value>(line) else { return false };
-        let number = |field: &str| line[field].as_u64();
-        number("step").is_some_and(|s| s <= steps) || number("validated").is_some_and(|s| s <= validated)
+    let step = |line: &str| {
+        let line: serde_json::Value = serde_json::from_str(line).ok()?;
+        line.get("flow")?;
+        serde_json::from_value(line).ok()
     };
-    let kept: String = text.lines().filter(keep).flat_map(|l| [l, "\n"]).collect();
-    write_bytes_atomically(&path, kept.as_bytes())
+    Ok(text.lines().filter_map(step).collect())
 }

@@ -2,14 +2,20 @@
 
 pub mod cost;
 pub mod data;
+pub mod freeze;
+pub mod health;
+pub mod layers;
 mod log;
 pub mod recipe;
+mod recipes;
 pub mod rotations;
 pub mod run;
+pub mod schedule;
 pub mod start;
 mod state;
 pub mod trainer;
 mod validation;
+pub mod vitals;
 
 pub use recipe::{OptimConfig, Plan, RunConfig};
 pub use trainer::{StepReport, Trainer};
@@ -32,11 +38,12 @@ use run::{Ended, Event, Run, RunMetrics};
 ///
 /// # Errors
 /// If the configuration, the folder or the data cannot be used, or a step fails.
-pub fn train(config: RunConfig, folder: &Path, tell: impl FnMut(Event)) -> Result<RunMetrics> {
+pub fn train(mut config: RunConfig, folder: &Path, tell: impl FnMut(Event)) -> Result<RunMetrics> {
     config.check()?;
     cost::check_memory(&config)?;
     Run::claim(folder)?;
     let data = data::open(&config, &|_, _, _| ())?;
+    config.set_epoch(data.train.len());
     match Run::create(folder, config)?.train(&data, || false, tell)? {
         Ended::Finished(metrics) => Ok(*metrics),
         Ended::Interrupted(step) => Err(Error::Failed(format!("stopped after step {step}"))),

@@ -3,20 +3,21 @@
 //! What belongs to the beginning of a training (warm-up, rotations, the delay of auto-masking) is a share of its steps,
 //! so that a recipe can be given another number of steps. [`RunConfig::plan`] turns the shares into steps.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+pub use super::layers::read_config;
 use super::rotations::{RotationPlan, Rotations};
+pub use super::schedule::{RateDecay, RateSchedule};
 use crate::data::batch::{Augment, Making};
 use crate::data::camera::Camera;
 use crate::data::stereo::{Baseline, Sources};
 use crate::error::{Error, Result};
-use crate::formats::bounded::{MAX_SETTINGS, read_text};
 use crate::monovit::loss::LossConfig;
 use crate::monovit::setup::check_size;
 use crate::monovit::{Ablation, Config, Preset, Setup};
-use crate::optim::{Decay, Schedule};
+use crate::optim::Schedule;
 
 /// Number of steps of the default run.
 pub const STEPS: u64 = 3800;
@@ -49,58 +50,6 @@ pub struct OptimConfig {
     pub schedule: RateSchedule,
 }
 
-/// A factor on the learning rates, in shares of the training's steps.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct RateSchedule {
-    /// The share of the steps over which the rates grow linearly from nothing.
-    pub warm_up: f64,
-    /// Decay after the warm-up.
-    pub decay: RateDecay,
-}
-
-/// Decay of the learning rates, in shares of the training's steps.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case", tag = "kind", deny_unknown_fields)]
-pub enum RateDecay {
-    /// No decay.
-    Constant,
-    /// By `factor`, once, after the share `at` of the steps.
-    Step {
-        /// The share of the steps.
-        at: f64,
-        /// The factor.
-        factor: f64,
-    },
-    /// By `factor` after every share `every` of the steps.
-    Exponential {
-        /// The share of the steps between two falls.
-        every: f64,
-        /// The factor.
-        factor: f64,
-    },
-    /// Along half a cosine wave, down to `end` times the rate at the last step.
-    Cosine {
-        /// The factor at the end.
-        end: f64,
-    },
-}
-
-impl RateSchedule {
-    /// The schedule of a training of so many steps.
-    pub fn over(&self, steps: u64) -> Schedule {
-        let decay = match self.decay {
-            RateDecay::Constant => Decay::Constant,
-            RateDecay::Step { at, factor } => Decay::Step { at: steps_of(at, steps), factor },
-            RateDecay::Exponential { every, factor } => {
-                Decay::Exponential { every: steps_of(every, steps).max(1), factor }
-            }
-            RateDecay::Cosine { end } => Decay::Cosine { steps, end },
-        };
-        Schedule { warm_up: steps_of(self.warm_up, steps), decay }
-    }
-}
-
 impl OptimConfig {
     /// Checks every number.
     ///
@@ -122,24 +71,7 @@ impl OptimConfig {
         check("optim.clip", clip, clip >= 0.0 && clip.is_finite(), "a bound above 0, or 0 for none")?;
         let average = self.average;
         check("optim.average", average, (0.0..1.0).contains(&average), "a number from 0 (for none) to below 1")?;
-        let schedule = self.schedule;
-        check_share("optim.schedule.warm_up", schedule.warm_up)?;
-        let check_factor = |field: &str, factor: f64| {
-            let field = format!("optim.schedule.decay.{field}");
-            check(field, factor, factor >= 0.0 && factor.is_finite(), "a factor from 0")
-        };
-        match schedule.decay {
-            RateDecay::Constant => Ok(()),
-            RateDecay::Step { at, factor } => {
-                check_share("optim.schedule.decay.at", at)?;
-                check_factor("factor", factor)
-            }
-            RateDecay::Exponential { every, factor } => {
-                check_share("optim.schedule.decay.every", every)?;
-                check_factor("factor", factor)
-            }
-            RateDecay::Cosine { end } => check_factor("end", end),
-        }
+        self.schedule.check()
     }
 }
 
@@ -158,11 +90,11 @@ impl Rotations {
     }
 }
 
-fn check(field: impl Into<String>, found: f64, good: bool, expected: &str) -> Result<()> {
+pub(super) fn check(field: impl Into<String>, found: f64, good: bool, expected: &str) -> Result<()> {
     if good { Ok(()) } else { Err(Error::setting(field, format!("{found} is not {expected}"))) }
 }
 
-fn check_share(field: &str, share: f64) -> Result<()> {
+pub(super) fn check_share(field: &str, share: f64) -> Result<()> {
     check(field, share, (0.0..=1.0).contains(&share), "a share of the steps, from 0 to 1")
 }
 
@@ -177,6 +109,10 @@ pub struct Plan {
     pub loss: LossConfig,
     /// The number of steps before auto-masking sets in.
     pub auto_mask_after: u64,
+    /// The number of batches whose gradients a step averages.
+    pub accumulate: usize,
+    /// The number of steps in which the pose networks learn alone.
+    pub pose_first: u64,
     /// Known rotations for the pose network.
     pub rotations: RotationPlan,
     /// Whether transformer layers are computed again in the backward pass.
@@ -197,8 +133,14 @@ pub struct RunConfig {
     pub width: usize,
     /// Batch size.
     pub batch: usize,
+    /// Number of batches whose gradients a step averages.
+    pub accumulate: usize,
     /// Number of training steps.
     pub steps: u64,
+    /// Number of epochs, where that is how the steps are counted: passes over the training samples. The steps follow from it
+    /// when a run is made.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub epochs: Option<u64>,
     /// Seed of everything random.
     pub seed: u64,
     /// `street`, or a folder: in the layout of KITTI raw, or of frames ([`data::frames`](crate::data::frames)).
@@ -243,6 +185,22 @@ pub struct RunConfig {
     pub log_every: u64,
     /// The whole state is written, and the weights are validated, every so many steps.
     pub checkpoint_every: u64,
+    /// Number of states that are kept: the newest, and those before it. From 3 on under their steps, too.
+    pub keep: usize,
+    /// Number of validations in a row without a new best after which training stops; without, it goes to the end.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub patience: Option<u64>,
+    /// Steps of an epoch, which is one pass over the training samples: found when a run is made.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub epoch: Option<u64>,
+    /// Patterns of the names of parameters and running statistics that stay as they are: `encoder.*`.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub freeze: Vec<String>,
+    /// The share of the steps, the first ones, in which the pose networks learn alone. Where weights from elsewhere start, a
+    /// pose network that does not know the new camera's motion yet would bend depths that are right: too long a
+    /// translation pushes what it sees towards the far end.
+    #[serde(default)]
+    pub pose_first: f64,
     /// The share of the steps before auto-masking sets in. While the motion is not known yet, a warped neighbour
     /// explains hardly any pixel better than an unwarped one, and masking would leave little to learn from.
     pub auto_mask_delay: f64,
@@ -273,7 +231,9 @@ impl RunConfig {
             height: 96,
             width: 320,
             batch: 4,
+            accumulate: 1,
             steps,
+            epochs: None,
             seed: 0,
             data: "street".into(),
             split: None,
@@ -290,6 +250,11 @@ impl RunConfig {
             recompute: false,
             log_every: 10,
             checkpoint_every: 200,
+            keep: 2,
+            patience: None,
+            epoch: None,
+            freeze: Vec::new(),
+            pose_first: 0.0,
             ablation: Ablation::default(),
             augment: Augment { flip: true, jitter: false },
             // Of the 3,800 steps of the default run these shares are 300, 500 before training and 600, and 100.
@@ -309,8 +274,12 @@ impl RunConfig {
         }
     }
 
-    /// The recipe for a start from trained weights: the published learning rates (MonoViT, section 4.1), pictures of
-    /// the weights' own size, and nothing of what random weights need.
+    /// The recipe for a start from trained weights: the published learning rates of depth (MonoViT, section 4.1), pictures
+    /// of the weights' own size, and nothing of what random weights need.
+    ///
+    /// The pose networks learn faster, and alone at first. They know the motion of another camera: where that moved three
+    /// times as far between two frames, depths of three times the distance explain the new pictures, and depth gets there
+    /// long before a pose network does whose output is scaled by 0.01.
     pub fn from_weights(setup: Setup, steps: u64) -> Self {
         let Setup { preset, ablation, height, width, min_depth, max_depth } = setup;
         let scratch = Self::new(preset, steps);
@@ -322,7 +291,8 @@ impl RunConfig {
             auto_mask_delay: 0.0,
             loss: LossConfig { min_depth, max_depth, ..scratch.loss },
             rotations: Rotations::default(),
-            optim: OptimConfig { encoder_rate: 5e-5, rate: 1e-4, pose_rate: 1e-4, ..scratch.optim },
+            pose_first: 0.3,
+            optim: OptimConfig { encoder_rate: 5e-5, rate: 1e-4, pose_rate: 1e-3, ..scratch.optim },
             ..scratch
         }
     }
@@ -350,9 +320,11 @@ impl RunConfig {
     pub fn plan(&self) -> Plan {
         Plan {
             optim: self.optim,
-            schedule: self.optim.schedule.over(self.steps),
+            schedule: self.optim.schedule.over(self.steps, self.epoch.unwrap_or(self.steps)),
             loss: self.loss,
             auto_mask_after: steps_of(self.auto_mask_delay, self.steps),
+            accumulate: self.accumulate,
+            pose_first: steps_of(self.pose_first, self.steps),
             rotations: match self.sources.in_time() {
                 true => self.rotations.over(self.steps),
                 // No pose network is asked.
@@ -368,6 +340,16 @@ impl RunConfig {
         Making { augment: self.augment, sources: self.sources, baseline: self.baseline }
     }
 
+    /// Notes how many steps a pass over so many training samples takes, and how many steps the epochs are, if those are what
+    /// counts.
+    pub fn set_epoch(&mut self, samples: usize) {
+        let epoch = samples.div_ceil(self.batch.saturating_mul(self.accumulate).max(1)) as u64;
+        self.epoch = Some(epoch);
+        if let Some(epochs) = self.epochs {
+            self.steps = epochs.saturating_mul(epoch);
+        }
+    }
+
     /// Checks what can be checked without data.
     ///
     /// # Errors
@@ -377,9 +359,14 @@ impl RunConfig {
         check_size("width", self.width)?;
         for (field, number) in [
             ("batch", self.batch as u64),
+            ("accumulate", self.accumulate as u64),
             ("steps", self.steps),
             ("log_every", self.log_every),
             ("checkpoint_every", self.checkpoint_every),
+            ("keep", self.keep as u64),
+            ("patience", self.patience.unwrap_or(1)),
+            ("epoch", self.epoch.unwrap_or(1)),
+            ("epochs", self.epochs.unwrap_or(1)),
         ] {
             if number == 0 {
                 return Err(Error::setting(field, "0 is too few: at least 1"));
@@ -388,6 +375,7 @@ impl RunConfig {
         if self.initial_disparity.is_some_and(|d| d.is_nan() || d <= 0.0 || d >= 1.0) {
             return Err(Error::setting("initial_disparity", "expected a number between 0 and 1"));
         }
+        check_share("pose_first", self.pose_first)?;
         check_share("auto_mask_delay", self.auto_mask_delay)?;
         self.loss.check()?;
         self.rotations.check()?;
@@ -411,64 +399,13 @@ fn none_one_or_many<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result
     })
 }
 
-/// Reads a configuration: a run's `config.toml`, or part of one; what it does not say is as in [`RunConfig::new`] of
-/// its preset.
-///
-/// # Errors
-/// Names the file, and the line where a value cannot be used.
-pub fn read_config(path: &Path) -> Result<RunConfig> {
-    let text = read_text(path, MAX_SETTINGS, "a configuration")?;
-    let wrong = |e: toml::de::Error| Error::file(path, e.to_string());
-    let said: toml::Table = toml::from_str(&text).map_err(wrong)?;
-    let preset = said.get("preset").cloned().map_or(Ok(Preset::Nano), toml::Value::try_into).map_err(wrong)?;
-    let usual = toml::Table::try_from(RunConfig::new(preset, STEPS));
-    let mut whole = usual.map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
-    fill(&mut whole, said);
-    let config: RunConfig = whole.try_into().map_err(wrong)?;
-    config.check().map_err(|error| match error {
-        Error::Setting { name, message } => {
-            let place = line_of(&text, &name).map_or(String::new(), |line| format!("line {line}: "));
-            Error::file(path, format!("{place}{name}: {message}"))
-        }
-        other => other,
-    })?;
-    Ok(config)
-}
-
-/// Puts what was said over the defaults, table by table. A choice (`kind`) with what belongs to it is one thing.
-fn fill(defaults: &mut toml::Table, said: toml::Table) {
-    for (key, value) in said {
-        match (defaults.get_mut(&key), value) {
-            (Some(toml::Value::Table(below)), toml::Value::Table(said)) if !said.contains_key("kind") => {
-                fill(below, said);
-            }
-            (_, value) => {
-                defaults.insert(key, value);
-            }
-        }
-    }
-}
-
-/// The line of a TOML text, from 1, that sets a field such as `optim.clip`.
-fn line_of(text: &str, field: &str) -> Option<usize> {
-    let (table, key) = field.rsplit_once('.').unwrap_or(("", field));
-    let mut within = "";
-    for (i, line) in text.lines().enumerate() {
-        let line = line.trim();
-        if let Some(name) = line.strip_prefix('[').and_then(|rest| rest.strip_suffix(']')) {
-            within = name.trim();
-        } else if within == table && line.split('=').next().is_some_and(|name| name.trim() == key) {
-            return Some(i + 1);
-        }
-    }
-    None
-}
-
 #[cfg(test)]
 mod tests {
     use std::fs::{self, File};
+    use std::path::Path;
 
     use super::*;
+    use crate::optim::Decay;
 
     fn written(text: &str) -> Result<RunConfig> {
         let place = tempfile::tempdir().unwrap();
@@ -516,6 +453,15 @@ mod tests {
     }
 
     #[test]
+    fn from_trained_weights_the_pose_networks_learn_first_and_depth_at_the_published_rates() {
+        let config = RunConfig::from_weights(Setup::of(Preset::Nano), 300);
+        assert_eq!((config.plan().pose_first, config.plan().rotations.steps), (90, 0));
+        let optim = config.optim;
+        assert!(optim.encoder_rate == 5e-5 && optim.rate == 1e-4 && optim.pose_rate > optim.rate);
+        assert_eq!(RunConfig::usual().plan().pose_first, 0);
+    }
+
+    #[test]
     fn what_is_written_is_read_back() {
         let config = RunConfig { split: Some("a list.txt".into()), ..RunConfig::usual() };
         assert_eq!(written(&toml::to_string(&config).unwrap()).unwrap(), config);
@@ -535,8 +481,12 @@ mod tests {
         for (line, text) in [
             ("line 1: steps", "steps = 0"),
             ("line 1: log_every", "log_every = 0"),
+            ("line 1: accumulate", "accumulate = 0"),
+            ("line 1: keep", "keep = 0"),
+            ("line 1: patience", "patience = 0"),
             ("line 2: checkpoint_every", "seed = 1\ncheckpoint_every = 0"),
             ("line 1: auto_mask_delay", "auto_mask_delay = 1.5"),
+            ("line 1: pose_first", "pose_first = -0.1"),
             ("line 2: optim.clip", "[optim]\nclip = inf"),
             ("line 2: optim.average", "[optim]\naverage = 2.0"),
             ("line 2: optim.rate", "[optim]\nrate = -1e-3"),

@@ -9,6 +9,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::freeze::Frozen;
 use super::recipe::steps_of;
 use crate::data::batch::Batch;
 use crate::monovit::MonoVit;
@@ -74,16 +75,16 @@ impl RotationPlan {
         self.pixels * (1.0 - 0.75 * step as f64 / self.steps as f64)
     }
 
-    /// What a step (from 0) of the training itself adds to its loss, if anything.
+    /// What a step (from 0) of the training itself adds to its loss, if anything; `pass` (from 0) counts the batches.
     pub(super) fn term(
         &self,
-        step: u64,
+        [step, pass]: [u64; 2],
         model: &MonoVit,
         c: &Context<f32>,
         batch: &Batch,
         seed: u64,
     ) -> Option<Var<f32>> {
-        let mut random = Random::of(seed, Stream::KeptRotations(step));
+        let mut random = Random::of(seed, Stream::KeptRotations(pass));
         let error = || rotation_error(model, c, batch, self.size(self.steps), &mut random);
         (step < self.keep && self.steps > 0).then(error).map(|e| e.affine(self.weight, 0.0))
     }
@@ -94,12 +95,18 @@ pub struct Lesson {
     plan: RotationPlan,
     adamw: AdamW<f32>,
     seed: u64,
+    frozen: Frozen,
 }
 
 impl Lesson {
     /// No steps taken.
     pub fn new(plan: RotationPlan, params: &Params<f32>, seed: u64) -> Self {
-        Lesson { plan, adamw: AdamW::new(params), seed }
+        Lesson { plan, adamw: AdamW::new(params), seed, frozen: Frozen::default() }
+    }
+
+    /// This lesson with some parameters and statistics left as they are.
+    pub fn keeping(self, frozen: Frozen) -> Self {
+        Lesson { frozen, ..self }
     }
 
     /// One step; the mean error in pixels before it.
@@ -107,7 +114,8 @@ impl Lesson {
         let step = self.adamw.steps;
         let tape = Tape::new();
         let mut random = Random::of(self.seed, Stream::Rotations(step));
-        let c = Context::training(params, &tape, Random::of(self.seed, Stream::RotationDropout));
+        let random_drop = Random::of(self.seed, Stream::RotationDropout);
+        let c = Context::training_part(params, &tape, random_drop, self.frozen.clone());
         let error = rotation_error(model, &c, batch, self.plan.size(step), &mut random);
         let gradients = c.gradients(&mut error.backward());
         let schedule = Schedule { warm_up: WARM_UP, decay: Decay::Constant };

@@ -1,7 +1,8 @@
 //! A training run: its folder, and the loop that fills it.
 //!
-//! `RUN/config.toml` (all of it, to run it again), `log.jsonl` (a line a logged step and a validation), `checkpoints/` (the
-//! whole state, and the one before it), `best.safetensors`, `metrics.json`, `images/`.
+//! `RUN/config.toml` (all of it, to run it again), `log.jsonl` (a line a logged step and a validation), `warnings.jsonl` (a
+//! line where a warning of [`health`](super::health) begins or ends), `checkpoints/` (the whole state, and the one before
+//! it), `best.safetensors` and `last.safetensors`, `metrics.json`, `images/`.
 //!
 //! What is computed is never lost: the state is written before anything is measured, and nothing that only concerns
 //! reporting ends a training.
@@ -13,6 +14,7 @@ use std::time::Instant;
 
 use serde::Serialize;
 
+use super::health::{Monitor, Warning};
 use super::log::{self, Log};
 use super::recipe::{RunConfig, read_config};
 use super::start::Start;
@@ -20,7 +22,7 @@ use super::state::{self, Notes};
 use super::trainer::{StepReport, Trainer};
 pub use super::validation::{RunMetrics, Validation};
 use crate::data::DataSource;
-use crate::data::batch::{Loader, SkipList};
+use crate::data::batch::{Batch, Loader, SkipList};
 use crate::error::{Error, Result};
 use crate::formats::atomic::{self, check_writable, write_bytes_atomically};
 use crate::formats::safetensors;
@@ -61,6 +63,8 @@ pub enum Event<'a> {
     Validating,
     /// Weights were validated.
     Validated(&'a Validation),
+    /// A sign that the training goes wrong begins to show, for the first time.
+    Health(&'a Warning),
     /// Something could not be measured, and why; training goes on.
     Warning(&'a str),
 }
@@ -121,8 +125,9 @@ impl Run {
             // Pose networks that somebody trained know rotations already.
             (config.rotations.share, config.rotations.keep) = (0.0, 0.0);
         }
+        let mut trainer = Trainer::of(start.model, start.params, config.plan());
+        trainer.freeze(&config.freeze)?;
         write_config(folder, &config)?;
-        let trainer = Trainer::of(start.model, start.params, config.plan());
         let run = Run {
             folder: folder.to_owned(),
             config,
@@ -163,6 +168,7 @@ impl Run {
             atomic::clean(place);
         }
         let mut trainer = Trainer::new(config.model(), config.plan());
+        trainer.freeze(&config.freeze)?;
         let notes = state::load(&mut trainer, folder, &mut tell)?;
         if config != before {
             write_config(folder, &config)?;
@@ -197,7 +203,8 @@ impl Run {
         }
         let mean_map = self.measure_beforehand(data, &mut tell);
         let validation = self.validation_batches(data, &mut tell);
-        let mut log = Log::open(&self.folder)?;
+        let mut log = Log::open(&self.folder, log::LOG)?;
+        let mut health = Health::open(&self.folder)?;
         if !self.learn_rotations(data, &stop, &mut tell)? {
             // The state on disk is that before the first of these steps: they will be taken again.
             return Ok(Ended::Interrupted(0));
@@ -206,16 +213,17 @@ impl Run {
             self.validate(data, &validation, &mut log, &mut tell)?;
         }
         let (making, batch, seed) = (self.config.making(), self.config.batch, self.config.seed);
-        let steps = self.trainer.steps();
-        let mut loader = Loader::start(data.train.clone(), making, batch, seed, steps, self.skip_list())?;
+        let accumulate = self.config.accumulate;
+        let passes = self.trainer.steps() * accumulate as u64;
+        let mut loader = Loader::start(data.train.clone(), making, batch, seed, passes, self.skip_list())?;
         tell(Event::Phase("training"));
         let (mut since, mut waited, mut counted) = (Instant::now(), 0.0, 0u32);
-        while self.trainer.steps() < self.config.steps {
+        while self.trainer.steps() < self.config.steps && !self.patience_is_over() {
             let asked = Instant::now();
-            let next = loader.next_batch();
-            let report = match next.and_then(|batch| {
+            let next: Result<Vec<Batch>> = (0..accumulate).map(|_| loader.next_batch()).collect();
+            let report = match next.and_then(|batches| {
                 waited += asked.elapsed().as_secs_f64();
-                self.trainer.step(&batch)
+                self.trainer.step_of(&batches)
             }) {
                 Ok(report) => report,
                 Err(error) => {
@@ -233,6 +241,7 @@ impl Run {
                 let n = f64::from(counted);
                 let (seconds, data_seconds) = (since.elapsed().as_secs_f64() / n, waited / n);
                 log.write(&StepLine { step: report, seconds, data_seconds })?;
+                health.see(&report, &mut tell)?;
                 self.notes.seconds += since.elapsed().as_secs_f64();
                 (since, waited, counted) = (Instant::now(), 0.0, 0);
             }
@@ -251,7 +260,15 @@ impl Run {
             }
         }
         drop(loader);
+        if self.trainer.steps() < self.config.steps {
+            tell(Event::Phase(&format!("stopping: no new best in {} validations", self.notes.since_best)));
+        }
         Ok(Ended::Finished(Box::new(self.finish(data, mean_map, &mut tell)?)))
+    }
+
+    /// Whether validation has found no new best for as long as the configuration waits.
+    fn patience_is_over(&self) -> bool {
+        self.config.patience.is_some_and(|patience| self.notes.since_best >= patience)
     }
 
     /// Whether the state is written after the step that was taken last.
@@ -293,7 +310,7 @@ impl Run {
 
     /// Writes the state; what it holds is checked first.
     pub(super) fn save(&self) -> Result<()> {
-        state::save(&self.trainer, &self.folder, &self.notes)
+        state::save(&self.trainer, &self.folder, &self.notes, self.config.keep)
     }
 
     /// Leaves weights to predict with where no validation has chosen any yet: those that training starts from, or has
@@ -307,8 +324,35 @@ impl Run {
     }
 }
 
+/// The monitor of a run, and where it writes to.
+struct Health {
+    monitor: Monitor,
+    log: Log,
+}
+
+impl Health {
+    /// A monitor that has seen what the run has logged already.
+    fn open(folder: &Path) -> Result<Self> {
+        let mut monitor = Monitor::default();
+        log::steps(folder)?.iter().for_each(|step| drop(monitor.see(step)));
+        Ok(Health { monitor, log: Log::open(folder, log::WARNINGS)? })
+    }
+
+    fn see(&mut self, step: &StepReport, tell: &mut impl FnMut(Event)) -> Result<()> {
+        for warning in self.monitor.see(step) {
+            self.log.write(&warning)?;
+            if warning.first {
+                tell(Event::Health(&warning));
+            }
+        }
+        Ok(())
+    }
+}
+
 /// The file of the weights that validation chose.
 pub(super) const BEST: &str = "best.safetensors";
+/// The file of the weights that training ended with.
+pub(super) const LAST: &str = "last.safetensors";
 /// The folder of states.
 pub(super) const CHECKPOINTS: &str = "checkpoints";
 const LOCK: &str = ".lock";

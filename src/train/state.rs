@@ -1,11 +1,12 @@
 //! The whole state of a training, to go on from: weights, moments, averages, steps, and notes on the run.
 //!
 //! `checkpoints/state.safetensors` is replaced only when the next one is whole on the disk, and stays as
-//! `previous.safetensors`: if one is damaged, the other is taken.
+//! `previous.safetensors`: if one is damaged, the other is taken. Where more than two are to be kept, each is there under
+//! the name of its step, too: to go on from one, put it in the place of `state.safetensors`.
 
 use std::collections::{BTreeMap, HashMap};
-use std::fs;
-use std::path::Path;
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
@@ -13,7 +14,7 @@ use super::run::CHECKPOINTS;
 use super::trainer::Trainer;
 use crate::error::{Error, Result};
 use crate::eval::metrics::Metrics;
-use crate::formats::atomic::write_bytes_atomically;
+use crate::formats::atomic::{write_atomically, write_bytes_atomically};
 use crate::formats::bounded::{MAX_SETTINGS, read_text};
 use crate::formats::safetensors;
 use crate::tensor::Tensor;
@@ -30,6 +31,9 @@ pub(super) struct Notes {
     /// The last step whose weights were validated.
     #[serde(default)]
     pub(super) validated: u64,
+    /// Validations since the best one.
+    #[serde(default)]
+    pub(super) since_best: u64,
 }
 
 /// [`Notes`] with the step of the state that they belong to.
@@ -53,11 +57,11 @@ const PREVIOUS: &str = "previous.safetensors";
 const NEXT: &str = "next.safetensors";
 const NOTES: &str = "notes.json";
 
-/// Writes the state of a run.
+/// Writes the state of a run, and removes what is older than the `keep` newest.
 ///
 /// # Errors
 /// If a number in it is not finite: the parameter is named, and the state on disk stays. If it cannot be written.
-pub(super) fn save(trainer: &Trainer, folder: &Path, notes: &Notes) -> Result<()> {
+pub(super) fn save(trainer: &Trainer, folder: &Path, notes: &Notes, keep: usize) -> Result<()> {
     trainer.check_finite()?;
     let folder = folder.join(CHECKPOINTS);
     let notes = serde_json::to_string(notes).map_err(|e| Error::Failed(format!("the state: {e}")))?;
@@ -66,7 +70,43 @@ pub(super) fn save(trainer: &Trainer, folder: &Path, notes: &Notes) -> Result<()
     if state.exists() {
         fs::rename(&state, &previous).map_err(|e| Error::io(&previous, e))?;
     }
-    fs::rename(&next, &state).map_err(|e| Error::io(&state, e))
+    fs::rename(&next, &state).map_err(|e| Error::io(&state, e))?;
+    if keep == 1 && previous.exists() {
+        fs::remove_file(&previous).map_err(|e| Error::io(&previous, e))?;
+    }
+    keep_under_steps(&folder, trainer.steps(), keep)
+}
+
+/// The beginning of the name of a state that is kept under its step.
+const STEP: &str = "step-";
+
+/// Keeps the newest state under its step, too, where more are wanted than the newest and the one before it, and removes
+/// the oldest of those.
+fn keep_under_steps(folder: &Path, step: u64, keep: usize) -> Result<()> {
+    if keep > 2 {
+        let named = folder.join(format!("{STEP}{step:08}.safetensors"));
+        if named.exists() {
+            fs::remove_file(&named).map_err(|e| Error::io(&named, e))?;
+        }
+        let state = folder.join(STATE);
+        // A second name costs no space; some file systems have none.
+        if fs::hard_link(&state, &named).is_err() {
+            write_atomically(&named, |out| std::io::copy(&mut File::open(&state)?, out).map(drop))?;
+        }
+    }
+    let entries = fs::read_dir(folder).map_err(|e| Error::io(folder, e))?;
+    let is_named = |path: &PathBuf| {
+        let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        let number = name.strip_prefix(STEP).and_then(|rest| rest.strip_suffix(".safetensors"));
+        number.is_some_and(|number| number.parse::<u64>().is_ok())
+    };
+    let mut named: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).filter(is_named).collect();
+    named.sort();
+    let kept = if keep > 2 { keep } else { 0 };
+    for old in &named[..named.len().saturating_sub(kept)] {
+        fs::remove_file(old).map_err(|e| Error::io(old, e))?;
+    }
+    Ok(())
 }
 
 /// Reads the newest state of a run that is whole into a trainer; `tell` hears of those that are not.

@@ -1,19 +1,23 @@
 //! One training step, and the state that it moves.
 
+use std::collections::HashMap;
+
 use serde::{Deserialize, Serialize};
 
+use super::freeze::{Frozen, frozen};
 use super::recipe::Plan;
 use super::rotations::Lesson;
+use super::vitals::{Signs, Vitals};
 use crate::data::batch::Batch;
 use crate::error::{Error, Result};
 use crate::monovit::MonoVit;
 use crate::monovit::config::Config;
 use crate::monovit::loss::{Loss, LossConfig, Scales, TieBreak, Views, loss};
-use crate::nn::{Context, Params};
-use crate::optim::{AdamW, Average, Group, clip_norm};
+use crate::nn::{Context, Param, ParamId, Params};
+use crate::optim::{AdamW, Average, Group, add, clip_from, norms, scale};
 use crate::random::{Random, Stream};
 use crate::tensor::profile;
-use crate::tensor::{Tape, Var};
+use crate::tensor::{Tape, Tensor, Var};
 
 /// The figures of a step.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -36,6 +40,36 @@ pub struct StepReport {
     pub learning_rates: [f64; 3],
     /// The norm of all gradients, before clipping.
     pub grad_norm: f64,
+    /// The norms of the gradients of the encoder, the decoder and the pose networks, before clipping.
+    #[serde(default)]
+    pub grad_norms: [f64; 3],
+    /// What the networks predict, in figures.
+    #[serde(default, flatten)]
+    pub vitals: Vitals,
+}
+
+impl StepReport {
+    /// The means of what batches show; step, rates and gradients stay empty.
+    fn mean(of: &[StepReport]) -> StepReport {
+        let mean = |figure: fn(&StepReport) -> f64| of.iter().map(figure).sum::<f64>() / of.len().max(1) as f64;
+        StepReport {
+            loss: mean(|r| r.loss),
+            photometric: mean(|r| r.photometric),
+            warped: mean(|r| r.warped),
+            unwarped: mean(|r| r.unwarped),
+            smoothness: mean(|r| r.smoothness),
+            auto_mask: mean(|r| r.auto_mask),
+            vitals: Vitals {
+                disparity: mean(|r| r.vitals.disparity),
+                disparity_spread: mean(|r| r.vitals.disparity_spread),
+                saturated: mean(|r| r.vitals.saturated),
+                translation: mean(|r| r.vitals.translation),
+                flow: mean(|r| r.vitals.flow),
+                inside: mean(|r| r.vitals.inside),
+            },
+            ..StepReport::default()
+        }
+    }
 }
 
 /// A model in training.
@@ -48,6 +82,42 @@ pub struct Trainer {
     pub(super) adamw: AdamW<f32>,
     pub(super) average: Option<Average<f32>>,
     ties: TieBreak<f32>,
+    /// The part that each parameter belongs to.
+    parts: Vec<usize>,
+    frozen: Frozen,
+}
+
+/// What one batch gives to a step.
+struct Pass {
+    gradients: Vec<Option<Tensor<f32>>>,
+    /// Running statistics that it moved.
+    moved: HashMap<ParamId, Tensor<f32>>,
+    /// Its figures, as far as they are those of a batch.
+    report: StepReport,
+}
+
+/// What a forward pass leaves behind.
+struct Forward {
+    c: Context<f32>,
+    found: Loss<f32>,
+    /// At full size, `[B, H, W, 1]`.
+    disparity: Tensor<f32>,
+    /// Of each source, `[B, 3, 4]`.
+    transforms: Vec<Tensor<f32>>,
+}
+
+/// The pose networks' part.
+const POSE: usize = 2;
+
+/// The part that a parameter belongs to: 0 the encoder, 1 the decoder, 2 the pose networks.
+fn part_of(name: &str) -> usize {
+    if name.starts_with("encoder.") {
+        0
+    } else if name.starts_with("depth.") {
+        1
+    } else {
+        POSE
+    }
 }
 
 /// What the loss compares in a batch.
@@ -84,7 +154,38 @@ impl Trainer {
         adamw.betas = plan.optim.betas;
         let average = (plan.optim.average > 0.0).then(|| Average::new(&params, plan.optim.average));
         let ties = TieBreak::new(plan.loss.tie_break, &mut Random::of(plan.seed, Stream::TiePool));
-        Trainer { model, params, plan, adamw, average, ties }
+        let parts = params.iter().map(|(_, p)| part_of(p.name())).collect();
+        Trainer { model, params, plan, adamw, average, ties, parts, frozen: Frozen::default() }
+    }
+
+    /// Leaves the parameters and running statistics alone that patterns name, such as `encoder.*`: they keep their bits,
+    /// and normalisations whose statistics are among them use those.
+    ///
+    /// # Errors
+    /// If a pattern matches nothing, or nothing is left to learn.
+    pub fn freeze(&mut self, patterns: &[String]) -> Result<()> {
+        self.frozen = frozen(&self.params, patterns)?;
+        if !self.pose_learns() {
+            self.plan.pose_first = 0;
+        }
+        Ok(())
+    }
+
+    /// Whether any parameter of the pose networks is not frozen.
+    fn pose_learns(&self) -> bool {
+        let learns = |(i, (_, p)): (usize, (_, &Param<f32>))| {
+            self.parts[i] == POSE && p.learnt && !self.frozen.get(i).copied().unwrap_or(false)
+        };
+        self.params.iter().enumerate().any(learns)
+    }
+
+    /// What stays as it is in a step (from 0).
+    fn frozen_at(&self, step: u64) -> Frozen {
+        if step >= self.plan.pose_first {
+            return self.frozen.clone();
+        }
+        let frozen = |i: usize| self.frozen.get(i).copied().unwrap_or(false);
+        self.parts.iter().enumerate().map(|(i, &part)| part != POSE || frozen(i)).collect()
     }
 
     /// Teaches the pose network known rotations, before the first step; `tell` hears of every step and its error in
@@ -95,7 +196,10 @@ impl Trainer {
         mut tell: impl FnMut(u64, f64) -> bool,
     ) -> Result<bool> {
         let rotations = self.plan.rotations;
-        let mut lesson = Lesson::new(rotations, &self.params, self.plan.seed);
+        if !self.pose_learns() {
+            return Ok(true);
+        }
+        let mut lesson = Lesson::new(rotations, &self.params, self.plan.seed).keeping(self.frozen.clone());
         for step in 1..=rotations.steps {
             let error = lesson.step(&self.model, &mut self.params, &next_batch()?);
             if !tell(step, error) {
@@ -116,95 +220,137 @@ impl Trainer {
         self.average.as_ref().map_or_else(|| self.params.clone(), |a| a.params(&self.params))
     }
 
-    /// The loss of a batch, and the context it was computed in.
-    fn forward(&self, tape: &Tape<f32>, batch: &Batch) -> (Context<f32>, Loss<f32>) {
+    /// The loss of a batch, and what it was computed from.
+    /// `pass` (from 0) counts the batches.
+    fn forward(&self, tape: &Tape<f32>, batch: &Batch, pass: u64) -> Forward {
         let step = self.adamw.steps;
-        let c = Context::training(&self.params, tape, Random::of(self.plan.seed, Stream::Dropout(step)));
+        let random = Random::of(self.plan.seed, Stream::Dropout(pass));
+        let c = Context::training_part(&self.params, tape, random, self.frozen_at(step));
         let c = c.recomputing(self.plan.recompute);
         let target = Var::constant(batch.target.clone());
         let disparities = self.model.disparities(&c, &target);
         let transforms = transforms(&self.model, &c, batch, &target);
-        let mut random = Random::of(self.plan.seed, Stream::Ties(step));
+        let mut random = Random::of(self.plan.seed, Stream::Ties(pass));
         let auto_mask = self.plan.loss.auto_mask && step >= self.plan.auto_mask_after;
         let config = LossConfig { auto_mask, ..self.plan.loss };
         let found =
             loss(&disparities, &transforms, &views(batch, config.scales), &config, Some((&self.ties, &mut random)));
-        (c, found)
+        let disparity = disparities[0].value().clone();
+        let transforms = transforms.iter().map(|t| t.value().clone()).collect();
+        Forward { c, found, disparity, transforms }
     }
 
-    /// One step: forward, backward, AdamW.
+    /// One step on one batch: forward, backward, AdamW.
     ///
     /// # Errors
-    /// If the loss or a gradient is not finite: the step, and the op that first made such a number; nothing is changed.
-    /// If a weight is not finite after the step: its name; that weight is lost.
+    /// As [`step_of`](Trainer::step_of).
     pub fn step(&mut self, batch: &Batch) -> Result<StepReport> {
+        self.step_of(std::slice::from_ref(batch))
+    }
+
+    /// One step on several batches of one size: AdamW with the mean of their gradients, which is that of all their samples
+    /// in one batch, but for normalisations, which see one batch after the other.
+    ///
+    /// # Errors
+    /// If the loss or a gradient is not finite: the step, and the op that first made such a number; no weight is changed.
+    /// If a weight is not finite after the step: its name; that weight is lost.
+    ///
+    /// # Panics
+    /// If there is no batch.
+    pub fn step_of(&mut self, batches: &[Batch]) -> Result<StepReport> {
         let step = self.adamw.steps + 1;
-        let tape = Tape::new();
-        let (c, found) = self.forward(&tape, batch);
-        let total = found.total.value().item() as f64;
-        if !total.is_finite() {
-            return Err(self.explain(step, batch));
+        let mut sum: Vec<Option<Tensor<f32>>> = Vec::new();
+        let mut reports = Vec::new();
+        for (i, batch) in batches.iter().enumerate() {
+            let Pass { gradients, moved, report } = self.pass((step - 1) * batches.len() as u64 + i as u64, batch)?;
+            if i == 0 {
+                sum = gradients;
+            } else {
+                profile::phase("sum of gradients", || add(&mut sum, gradients));
+            }
+            reports.push(report);
+            profile::phase("running statistics", || {
+                for (id, value) in moved {
+                    self.params.set(id, value);
+                }
+            });
         }
-        let objective = match self.plan.rotations.term(step - 1, &self.model, &c, batch, self.plan.seed) {
-            Some(term) => &found.total + term,
-            None => found.total.clone(),
-        };
-        let mut all = objective.backward();
-        let mut gradients = c.gradients(&mut all);
-        // From here on nobody else holds the weights: they are changed in place.
-        let moved = c.into_moved();
-        let bound = if self.plan.optim.clip > 0.0 { self.plan.optim.clip } else { f64::INFINITY };
-        let grad_norm = profile::phase("norm of the gradients", || clip_norm(&mut gradients, bound));
-        if !grad_norm.is_finite() {
-            let bad = self.params.iter().zip(&gradients).find(|(_, g)| g.as_ref().is_some_and(|g| !g.is_finite()));
-            let name = bad.map_or("of a parameter", |((_, p), _)| p.name());
-            return Err(Error::Failed(format!(
-                "step {step}: the gradient of {name} is not finite (the loss is {total})"
-            )));
+        if batches.len() > 1 {
+            scale(&mut sum, 1.0 / batches.len() as f64);
         }
+        let (grad_norms, grad_norm) = self.clip(&mut sum, &reports)?;
         let factor = self.plan.schedule.factor(step);
         let learning_rates =
             [self.plan.optim.encoder_rate, self.plan.optim.rate, self.plan.optim.pose_rate].map(|r| r * factor);
         let decay = self.plan.optim.decay;
-        let group = |name: &str| {
-            let which = if name.starts_with("encoder.") {
-                0
-            } else if name.starts_with("depth.") {
-                1
-            } else {
-                2
-            };
-            Group { learning_rate: learning_rates[which], decay }
-        };
-        if !profile::phase("adamw", || self.adamw.step(&mut self.params, &gradients, group)) {
+        let group = |name: &str| Group { learning_rate: learning_rates[part_of(name)], decay };
+        if !profile::phase("adamw", || self.adamw.step(&mut self.params, &sum, group)) {
             self.check_finite()?;
         }
-        profile::phase("running statistics", || {
-            for (id, value) in moved {
-                self.params.set(id, value);
-            }
-        });
         if let Some(average) = &mut self.average {
             profile::phase("weight averaging", || average.update(&self.params, step));
         }
+        Ok(StepReport { step, learning_rates, grad_norm, grad_norms, ..StepReport::mean(&reports) })
+    }
+
+    /// Bounds the norm of the gradients; the norms of the parts and of the whole before.
+    fn clip(&self, gradients: &mut [Option<Tensor<f32>>], reports: &[StepReport]) -> Result<([f64; 3], f64)> {
+        let bound = if self.plan.optim.clip > 0.0 { self.plan.optim.clip } else { f64::INFINITY };
+        let (parts, whole) = profile::phase("norm of the gradients", || {
+            let parts: [f64; 3] = norms(gradients, |i| self.parts[i]);
+            let whole = parts.iter().map(|norm| norm * norm).sum::<f64>().sqrt();
+            clip_from(gradients, whole, bound);
+            (parts, whole)
+        });
+        if !whole.is_finite() {
+            let bad = self.params.iter().zip(&*gradients).find(|(_, g)| g.as_ref().is_some_and(|g| !g.is_finite()));
+            let name = bad.map_or("of a parameter", |((_, p), _)| p.name());
+            return Err(Error::Failed(format!(
+                "step {}: the gradient of {name} is not finite (the loss is {})",
+                self.adamw.steps + 1,
+                StepReport::mean(reports).loss
+            )));
+        }
+        Ok((parts, whole))
+    }
+
+    /// Forward and backward for one batch; `pass` (from 0) counts the batches.
+    fn pass(&self, pass: u64, batch: &Batch) -> Result<Pass> {
+        let step = self.adamw.steps;
+        let tape = Tape::new();
+        let Forward { c, found, disparity, transforms } = self.forward(&tape, batch, pass);
+        let total = found.total.value().item() as f64;
+        if !total.is_finite() {
+            return Err(self.explain(step + 1, batch, pass));
+        }
+        let objective = match self.plan.rotations.term([step, pass], &self.model, &c, batch, self.plan.seed) {
+            Some(term) => &found.total + term,
+            None => found.total.clone(),
+        };
+        let mut all = objective.backward();
+        let gradients = c.gradients(&mut all);
+        // From here on nobody else holds the weights: they are changed in place.
+        let moved = c.into_moved();
         let report = StepReport {
-            step,
             loss: total,
             photometric: found.photometric,
             warped: found.warped,
             unwarped: found.unwarped,
             smoothness: found.smoothness,
             auto_mask: found.auto_mask,
-            learning_rates,
-            grad_norm,
+            vitals: profile::phase("vitals", || {
+                let signs = Signs { disparity: &disparity, transforms: &transforms, intrinsics: &batch.intrinsics };
+                Vitals::of(&signs, &self.plan.loss)
+            }),
+            ..StepReport::default()
         };
-        profile::phase("freeing", move || drop((all, gradients, objective, found, tape)));
-        Ok(report)
+        profile::phase("freeing", move || drop((all, objective, found, disparity, transforms, tape)));
+        Ok(Pass { gradients, moved, report })
     }
 
     /// Runs the forward pass once more, looking at every number.
-    fn explain(&self, step: u64, batch: &Batch) -> Error {
-        let culprit = profile::first_not_finite(|| self.forward(&Tape::new(), batch));
+    fn explain(&self, step: u64, batch: &Batch, pass: u64) -> Error {
+        let culprit = profile::first_not_finite(|| self.forward(&Tape::new(), batch, pass));
         Error::Failed(match culprit {
             Some(culprit) => format!(
                 "step {step}: the loss is not finite; {culprit}. The last good checkpoint is kept: try a smaller learning \

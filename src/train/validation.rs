@@ -5,7 +5,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::log::Log;
-use super::run::{BEST, Event, Run, RunData, load_weights, write_weights};
+use super::run::{BEST, Event, LAST, Run, RunData, load_weights, write_weights};
 use crate::data::DataSource;
 use crate::data::batch::{Augment, Batch, Making, batch_of_readable, batch_of_step};
 use crate::error::{Error, Result};
@@ -77,6 +77,9 @@ impl Run {
         let found = told("validation data", batches.collect::<Result<Vec<_>>>(), tell).unwrap_or_default();
         if found.is_empty() {
             tell(Event::Warning("there is no validation data: the last weights will count as the best"));
+            if self.config.patience.is_some() {
+                tell(Event::Warning("patience has no effect without validation data"));
+            }
         }
         found
     }
@@ -120,6 +123,7 @@ impl Run {
             }
             // A number that is none is never the best.
             let best = photometric.is_finite() && self.notes.best.is_none_or(|b| photometric < b);
+            self.notes.since_best = if best { 0 } else { self.notes.since_best + 1 };
             if best {
                 self.notes.best = Some(photometric);
                 write_weights(&self.folder.join(BEST), &weights, &self.config.setup())?;
@@ -146,6 +150,7 @@ impl Run {
     ) -> Result<RunMetrics> {
         tell(Event::Phase("measuring the best weights"));
         let best = self.folder.join(BEST);
+        write_weights(&self.folder.join(LAST), &self.trainer.weights(), &self.config.setup())?;
         if self.notes.best.is_none() {
             write_weights(&best, &self.trainer.weights(), &self.config.setup())?;
         }
