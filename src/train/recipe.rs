@@ -324,7 +324,7 @@ impl RunConfig {
             loss: self.loss,
             auto_mask_after: steps_of(self.auto_mask_delay, self.steps),
             accumulate: self.accumulate,
-            pose_first: steps_of(self.pose_first, self.steps),
+            pose_first: if self.sources.in_time() { steps_of(self.pose_first, self.steps) } else { 0 },
             rotations: match self.sources.in_time() {
                 true => self.rotations.over(self.steps),
                 // No pose network is asked.
