@@ -161,3 +161,49 @@ fn the_truth_as_another_programs_disparities_is_perfect() {
     fails(&["eval", "--data", text(street)], 2, &["--weights"]);
     fails(&[&flags[..], &["--flip"]].concat(), 2, &["--flip"]);
 }
+
+#[test]
+fn protocols_and_scales_are_said_and_what_does_not_fit_is_refused() {
+    let (street, weights) = made();
+    let flags = ["eval", "--weights", text(weights), "--data", text(street)];
+    let with = |more: &[&'static str]| [&flags[..], more].concat();
+    let table = said(&with(&["--protocol", "kitti2015", "--scale", "stereo"]));
+    for line in ["protocol  kitti2015: every pixel of the truth, no crop", "scaling   stereo: times 5.4", "RMSE log "] {
+        assert!(table.contains(line), "{line}: {table}");
+    }
+    fails(&with(&["--protocol", "make3d"]), 2, &["--protocol: make3d is for ground truth of 55 or 21 rows of 305"]);
+    fails(&with(&["--protocol", "kitti"]), 2, &["dense, eigen", "cityscapes", "\"kitti\""]);
+    fails(&with(&["--scale", "camera-height=0"]), 2, &["camera-height=METRES"]);
+    fails(&with(&["--protocol", "projected"]), 1, &["proj_depth/velodyne/image_02/0000000000.npz", "6 of 6 frames"]);
+}
+
+/// The exact depth of the street, in a unit of its own, has the scale of the camera's height: 1.65 m.
+#[test]
+fn the_cameras_height_gives_the_scale_without_ground_truth() {
+    let place = tempfile::tempdir().expect("a folder");
+    let street = place.path().join("street");
+    let size = ["--sequences", "2", "--frames", "3", "--height", "96", "--width", "320"];
+    said(&[&["data", "street", "--out", text(&street)][..], &size].concat());
+    let data = Kitti::open(&street, None, 96, 320, Options { neighbours: false, ..Options::default() });
+    let data = data.expect("opened");
+    let mut values = Vec::new();
+    for sample in 0..data.len() {
+        let depth = data.depth(sample).expect("read").expect("depth");
+        values.extend(depth.metres.iter().map(|&m| if m > 0.0 { 7.0 / m } else { 0.01 }));
+    }
+    let file = place.path().join("disps.npy");
+    write_npy_shaped(&file, &values, &[6, 96, 320]).expect("written");
+    let flags = ["eval", "--disparities", text(&file), "--data", text(&street), "--scale", "camera-height", "--json"];
+    let json: serde_json::Value = serde_json::from_str(&said(&flags)).expect("JSON");
+    assert_eq!((&json["scale"], &json["images"]), (&"camera-height=1.65".into(), &6.into()));
+    assert!((json["ratio_median"].as_f64().expect("a number") / 7.0 - 1.0).abs() < 0.03, "{json}");
+    // A wall shows no road: the image is counted and in none of the numbers.
+    values[..96 * 320].fill(0.2);
+    write_npy_shaped(&file, &values, &[6, 96, 320]).expect("written");
+    let json: serde_json::Value = serde_json::from_str(&said(&flags)).expect("JSON");
+    assert_eq!((&json["images"], json["without_scale"].as_array().expect("a list").len()), (&5.into(), 1));
+    assert_eq!(json["skipped"][0]["why"], "no road to measure the camera's height over");
+    values.fill(0.2);
+    write_npy_shaped(&file, &values, &[6, 96, 320]).expect("written");
+    fails(&flags, 1, &["6 frames show no road"]);
+}
