@@ -207,3 +207,58 @@ fn the_cameras_height_gives_the_scale_without_ground_truth() {
     write_npy_shaped(&file, &values, &[6, 96, 320]).expect("written");
     fails(&flags, 1, &["6 frames show no road"]);
 }
+
+/// Weights as other draws have them.
+fn other_weights(place: &Path) -> PathBuf {
+    let path = place.join("other.safetensors");
+    let config = RunConfig { height: 64, width: 96, ..RunConfig::new(Preset::Pico, 1) };
+    let (_, params) = MonoVit::new::<f32>(config.model(), 12);
+    write_weights(&path, &params, &config.setup()).expect("weights");
+    path
+}
+
+#[test]
+fn more_than_a_mean_is_written_and_weights_stand_beside_each_other() {
+    let (_, weights) = made();
+    let place = tempfile::tempdir().expect("a folder");
+    let street = place.path().join("street");
+    let size = ["--sequences", "2", "--frames", "4", "--height", "64", "--width", "96"];
+    said(&[&["data", "street", "--out", text(&street)][..], &size].concat());
+    let other = other_weights(place.path());
+    let [csv, plot, sheets] = ["images.csv", "distance.svg", "sheets"].map(|name| place.path().join(name));
+    let flags = ["eval", "--data", text(&street), "--weights", text(weights), text(&other), text(weights)];
+    let more = ["--csv", text(&csv), "--plot", text(&plot), "--sheets", text(&sheets)];
+    let json = said(&[&flags[..], &more, &["--json", "--bins", "0,10,30"]].concat());
+    let json: serde_json::Value = serde_json::from_str(&json).expect("JSON");
+
+    let number = |value: &serde_json::Value| value.as_f64().expect("a number");
+    assert_eq!((&json["interval"]["unit"], &json["interval"]["units"]), (&"sequences".into(), &2.into()));
+    assert!(number(&json["interval"]["low"]["abs_rel"]) <= number(&json["abs_rel"]));
+    let pixels = |groups: &serde_json::Value| -> u64 {
+        groups.as_array().expect("a list").iter().map(|group| group["pixels"].as_u64().expect("a count")).sum()
+    };
+    assert_eq!(pixels(&json["per_image"]), pixels(&json["distances"]));
+    assert_eq!(pixels(&json["per_image"]), pixels(&json["regions"]));
+    assert_eq!(json["sets"].as_array().expect("a list").len(), 2);
+    let [b, same] = &json["others"].as_array().expect("a list")[..] else { panic!("{json}") };
+    let by = number(&b["abs_rel"]) - number(&json["abs_rel"]);
+    assert!(by != 0.0 && (number(&b["difference"]["abs_rel"]) - by).abs() < 1e-12);
+    assert_eq!((&same["difference"]["abs_rel"], &same["difference"]["images"]), (&0.0.into(), &8.into()));
+
+    let lines = std::fs::read_to_string(&csv).expect("a table");
+    assert_eq!(lines.lines().count(), 1 + 3 * 8);
+    let mean: f64 =
+        lines.lines().skip(1).take(8).map(|l| l.split(',').nth(5).expect("abs_rel").parse::<f64>().expect("")).sum();
+    assert!((mean / 8.0 - number(&json["abs_rel"])).abs() < 1e-12);
+    let svg = std::fs::read_to_string(&plot).expect("a plot");
+    assert_eq!((svg.matches("<polyline").count(), svg.contains("0 to 10 m")), (3, true));
+    assert_eq!(std::fs::read_dir(&sheets).expect("a folder").count(), 8);
+
+    let table = said(&[&flags[..5], &["--details"]].concat());
+    for part in ["intervals 95 %, bootstrap of 1000 draws from 2 whole sequences", "bottom centre", "by sequence"] {
+        assert!(table.contains(part), "{part}: {table}");
+    }
+    fails(&[&flags[..], &["--bins", "10,5"]].concat(), 2, &["--bins: expected metres from 0 up"]);
+    let small = ["eval", "--weights", text(weights), text(&other), "--height", "32", "--bootstrap", "0"];
+    assert!(!said(&[&small[..], &["--width", "32"]].concat()).contains("intervals"));
+}

@@ -1,23 +1,37 @@
 //! `parallax eval`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use parallax::Result;
+use parallax::data::DataSource;
+use parallax::data::kitti::LeftOut;
+use parallax::eval::breakdown::BINS;
+use parallax::eval::csv;
+use parallax::eval::evaluate::{ByNetwork, Evaluation};
 use parallax::eval::predictions::Predictions;
-use parallax::eval::predictor::{Evaluation, Predictor, evaluate, evaluate_predictions};
+use parallax::eval::predictor::Predictor;
 use parallax::eval::protocol::Protocol;
 use parallax::eval::scale::Scale;
+use parallax::eval::study::{Settings, Study, study};
+use parallax::formats::atomic::write_bytes_atomically;
+use parallax::train::data::STREET;
 use parallax::weights::Weights;
+use parallax::{Error, Result};
 
 use super::progress::Progress;
 use super::sizes::Numbers;
-use measured::{Measured, skipped};
+use measured::{Measured, One};
 
 mod measured;
+mod sheets;
 mod source;
 
 #[derive(clap::Args)]
-#[command(mut_arg("weights", |weights| weights.required(false).required_unless_present("disparities")))]
+#[command(mut_arg("weights", |weights| {
+    weights.required(false).required_unless_present("disparities").num_args(1..).help(
+        "Weights: a run's folder (its best weights), a file (.safetensors, .pth, .npz), or a folder with encoder.pth, \
+         depth.pth, ...; several networks (A B C) are set beside each other, the others less the first",
+    )
+}))]
 pub struct Args {
     #[command(flatten)]
     weights: super::weights::WeightsArgs,
@@ -60,11 +74,34 @@ pub struct Args {
     /// Seed of the street.
     #[arg(long, value_name = "N", default_value_t = 3_000_000)]
     seed: u64,
+    /// How often images are drawn again for the 95 % intervals of the means (percentile bootstrap; whole sequences
+    /// where there are several); 0: no intervals.
+    #[arg(long, value_name = "N", default_value_t = 1000, help_heading = "More than a mean")]
+    bootstrap: usize,
+    /// Where bins of true distance begin, in metres, with commas [default: 0,5,10,20,30,40,60,80].
+    #[arg(long, value_name = "METRES", value_delimiter = ',', help_heading = "More than a mean")]
+    bins: Option<Vec<f64>>,
+    /// Also print errors by distance, by ninths of the picture, and by sequence.
+    #[arg(long, help_heading = "More than a mean")]
+    details: bool,
+    /// Write the metrics of every image into a table of comma-separated values.
+    #[arg(long, value_name = "FILE", help_heading = "More than a mean")]
+    csv: Option<PathBuf>,
+    /// Draw the ten images with the largest Abs Rel (of the first weights) into a folder: 01.png the worst.
+    ///
+    /// Each with its picture, predicted and true depth in one scale of colours, and relative error.
+    #[arg(long, value_name = "DIR", help_heading = "More than a mean")]
+    sheets: Option<PathBuf>,
+    /// Draw Abs Rel by distance, as SVG.
+    #[arg(long, value_name = "FILE", help_heading = "More than a mean")]
+    plot: Option<PathBuf>,
     /// Print one JSON object: what was measured, how, and the metrics of all and of each image.
     ///
     /// weights or disparities, data, split, protocol, scale, flip, precision, height, width (of the predictions), frames, images
     /// (those that were measured), skipped: [{why, frames, first}], abs_rel, sq_rel, rmse, rmse_log, a1, a2, a3,
-    /// ratio_median, ratio_std, per_image, without_pixels, without_depth, without_scale.
+    /// ratio_median, ratio_std, per_image, without_pixels, without_depth, without_scale,
+    /// sequences (of each image), interval: {unit, units, replicates, low, high}, distances, regions, sets, others (further
+    /// weights: the same, and their difference from the first).
     #[arg(long, verbatim_doc_comment)]
     json: bool,
 }
@@ -75,53 +112,102 @@ enum By {
     File(Predictions),
 }
 
+/// Something that predicts, and what it is called.
+struct Candidate {
+    name: String,
+    by: By,
+    height: usize,
+    width: usize,
+}
+
 pub fn run(args: Args) -> Result<()> {
-    let (by, (height, width)) = match &args.disparities {
-        Some(path) => {
-            let found = Predictions::read(path)?;
-            let size = found.size;
-            (By::File(found), size)
+    let settings =
+        Settings { bins: args.bins.clone().unwrap_or(BINS.to_vec()), replicates: args.bootstrap, seed: args.seed };
+    let mut found: Vec<One> = Vec::new();
+    let mut left_out = LeftOut::default();
+    for weights in args.weights.each() {
+        let candidate = args.candidate(&weights)?;
+        let (height, width) = (candidate.height, candidate.width);
+        if let Some(first) = found.first().filter(|first| (first.height, first.width) != (height, width))
+            && args.data == STREET
+        {
+            let message = format!(
+                "{} sees pictures of {height}x{width}, {} of {}x{}: give --height and --width, so that both see one street",
+                candidate.name, first.name, first.height, first.width
+            );
+            return Err(Error::setting("weights", message));
         }
-        None => {
-            let Weights { model, params, setup, .. } = args.weights.load()?;
-            let predictor = Predictor::new(&model, &params, &setup).with_precision(args.precision.checked()?)?;
-            (By::Network(Box::new(predictor)), (setup.height, setup.width))
+        let (data, lacking) = source::open(&args, height, width)?;
+        left_out = lacking;
+        let mut progress = Progress::new("images", data.len() as u64);
+        let study = candidate.measure(data.as_ref(), &args, &settings, |done| progress.set(done as u64, ""))?;
+        progress.finish();
+        if let (Some(folder), true) = (&args.sheets, found.is_empty()) {
+            candidate.draw_worst(folder, &study, data.as_ref(), args.evaluation())?;
         }
-    };
-    let (data, left_out) = source::open(&args, height, width)?;
-    let mut progress = Progress::new("images", data.len() as u64);
-    let how = Evaluation { protocol: args.protocol, scale: args.scale, flip: args.flip };
-    let seen = |done| progress.set(done as u64, "");
-    let report = match &by {
-        By::Network(predictor) => {
-            let samples: Vec<usize> = (0..data.len()).collect();
-            evaluate(predictor, data.as_ref(), &samples, how, seen)?
-        }
-        By::File(predictions) => evaluate_predictions(predictions, data.as_ref(), how, seen)?,
-    };
-    progress.finish();
-    let precision = args.disparities.is_none().then_some(args.precision);
-    let measured = Measured {
-        weights: args.disparities.is_none().then(|| args.weights.name()),
-        disparities: args.disparities,
-        data: match args.data.as_str() {
-            "street" => format!("street of seed {}", args.seed),
-            folder => folder.to_owned(),
-        },
-        split: args.split,
-        protocol: args.protocol,
-        scale: args.scale,
-        flip: args.flip,
-        precision,
-        height,
-        width,
-        frames: data.len() + left_out.without_depth,
-        skipped: skipped(&report, &left_out),
-        report,
-    };
+        let (frames, name) = (data.len() + left_out.without_depth, candidate.name);
+        let difference = found.first().and_then(|first: &One| study.less(&first.study, &settings));
+        found.push(One { name, height, width, frames, study, difference });
+    }
+    let measured = Measured::new(&args, found, &left_out);
+    if let Some(path) = &args.csv {
+        csv::write(path, &measured.studies())?;
+    }
+    if let Some(path) = &args.plot {
+        write_bytes_atomically(path, measured.plot().svg().as_bytes())?;
+    }
     if args.json {
         return super::print_json(&measured);
     }
-    measured.print();
+    measured.print(args.details);
     Ok(())
+}
+
+impl Args {
+    fn evaluation(&self) -> Evaluation {
+        Evaluation { protocol: self.protocol, scale: self.scale, flip: self.flip }
+    }
+
+    /// What predicts: another program's file, or these weights.
+    fn candidate(&self, weights: &super::weights::WeightsArgs) -> Result<Candidate> {
+        if let Some(path) = &self.disparities {
+            let found = Predictions::read(path)?;
+            let (height, width) = found.size;
+            return Ok(Candidate { name: path.display().to_string(), by: By::File(found), height, width });
+        }
+        let Weights { model, params, setup, .. } = weights.load()?;
+        let predictor = Predictor::new(&model, &params, &setup).with_precision(self.precision.checked()?)?;
+        let by = By::Network(Box::new(predictor));
+        Ok(Candidate { name: weights.name(), by, height: setup.height, width: setup.width })
+    }
+}
+
+impl Candidate {
+    fn draw_worst(&self, folder: &Path, study: &Study, data: &dyn DataSource, how: Evaluation) -> Result<()> {
+        let written = match &self.by {
+            By::Network(predictor) => {
+                sheets::write_worst(folder, study, &ByNetwork { predictor, flip: how.flip }, data, how)?
+            }
+            By::File(predictions) => sheets::write_worst(folder, study, predictions, data, how)?,
+        };
+        note!("{} sheets of the worst images are in {}", written.len(), folder.display());
+        Ok(())
+    }
+
+    fn measure(
+        &self,
+        data: &dyn DataSource,
+        args: &Args,
+        settings: &Settings,
+        seen: impl FnMut(usize),
+    ) -> Result<Study> {
+        let how = args.evaluation();
+        match &self.by {
+            By::Network(predictor) => study(&ByNetwork { predictor, flip: how.flip }, data, how, settings, seen),
+            By::File(predictions) => {
+                predictions.check(data.len())?;
+                study(predictions, data, how, settings, seen)
+            }
+        }
+    }
 }

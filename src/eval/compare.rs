@@ -29,6 +29,8 @@ pub struct Comparison {
     pub pairs: Vec<Pair>,
     /// The factor that was found for this image; `None` if it was given, or without a pixel.
     pub ratio: Option<f64>,
+    /// What predicted depths were multiplied by.
+    pub factor: f64,
     /// The logarithm of RMSE log.
     pub logarithm: Logarithm,
 }
@@ -85,7 +87,7 @@ pub fn compare_image(
     for pair in &mut pairs {
         pair.prediction = (pair.prediction * factor).clamp(nearest, farthest);
     }
-    Ok(Comparison { size: (height, width), pairs, ratio, logarithm: rules.logarithm })
+    Ok(Comparison { size: (height, width), pairs, ratio, factor, logarithm: rules.logarithm })
 }
 
 /// [`compare_image`], and the metrics of what counts.

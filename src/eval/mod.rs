@@ -1,8 +1,11 @@
 //! Depth of pictures, and how good it is: prediction, protocols and metrics, scale from the camera's height, attention maps.
 
 pub mod attention;
+pub mod bootstrap;
+pub mod breakdown;
 pub mod camera_height;
 pub mod compare;
+pub mod csv;
 pub mod evaluate;
 pub mod flip;
 pub mod mean_map;
@@ -13,3 +16,4 @@ pub mod projected;
 pub mod protocol;
 pub mod scale;
 pub mod statistics;
+pub mod study;
