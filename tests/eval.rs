@@ -262,3 +262,28 @@ fn more_than_a_mean_is_written_and_weights_stand_beside_each_other() {
     let small = ["eval", "--weights", text(weights), text(&other), "--height", "32", "--bootstrap", "0"];
     assert!(!said(&[&small[..], &["--width", "32"]].concat()).contains("intervals"));
 }
+
+#[test]
+fn a_folder_of_predictions_is_matched_by_name() {
+    let (street, weights) = made();
+    let place = tempfile::tempdir().expect("a folder");
+    let split = place.path().join("list.txt");
+    std::fs::write(&split, format!("{DRIVE} 3 l\n{DRIVE} 1 l\n")).expect("written");
+    let depth = place.path().join("depth");
+    let predict = ["predict", "--weights", text(weights), text(street), "--out", text(&depth), "--npy"];
+    said(&predict);
+    let flags = ["eval", "--data", text(street), "--split", text(&split), "--predictions", text(&depth), "--inverse"];
+    // The same numbers as the network itself, whose maps have the truth's size.
+    fails(&flags, 1, &["predictions of no frame", "--ignore-extra"]);
+    let number = |flags: &[&str]| {
+        let json: serde_json::Value = serde_json::from_str(&said(&[flags, &["--json"]].concat())).expect("JSON");
+        json["abs_rel"].as_f64().expect("a number")
+    };
+    let found = number(&[&flags[..], &["--ignore-extra"]].concat());
+    let own = number(&["eval", "--data", text(street), "--split", text(&split), "--weights", text(weights)]);
+    assert!((found - own).abs() < 1e-6, "{found} {own}");
+    std::fs::remove_file(depth.join(format!("{DRIVE}/image_02/data/0000000001.npy"))).expect("removed");
+    let missing = [&flags[..], &["--ignore-extra"]].concat();
+    fails(&missing, 1, &["1 of 2 frames have no prediction", &format!("{DRIVE} 1 l"), "0000000001.png or .npy"]);
+    fails(&["eval", "--predictions", text(&depth)], 2, &["--predictions", "data street"]);
+}

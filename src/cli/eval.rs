@@ -1,17 +1,18 @@
 //! `parallax eval`.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use parallax::data::DataSource;
 use parallax::data::kitti::LeftOut;
 use parallax::eval::breakdown::BINS;
 use parallax::eval::csv;
-use parallax::eval::evaluate::{ByNetwork, Evaluation};
+use parallax::eval::evaluate::{ByNetwork, Evaluation, Predicts};
+use parallax::eval::folder::{Holds, PredictionFolder};
 use parallax::eval::predictions::Predictions;
 use parallax::eval::predictor::Predictor;
 use parallax::eval::protocol::Protocol;
 use parallax::eval::scale::Scale;
-use parallax::eval::study::{Settings, Study, study};
+use parallax::eval::study::{Settings, study};
 use parallax::formats::atomic::write_bytes_atomically;
 use parallax::train::data::STREET;
 use parallax::weights::Weights;
@@ -27,7 +28,7 @@ mod source;
 
 #[derive(clap::Args)]
 #[command(mut_arg("weights", |weights| {
-    weights.required(false).required_unless_present("disparities").num_args(1..).help(
+    weights.required(false).required_unless_present_any(["disparities", "predictions"]).num_args(1..).help(
         "Weights: a run's folder (its best weights), a file (.safetensors, .pth, .npz), or a folder with encoder.pth, \
          depth.pth, ...; several networks (A B C) are set beside each other, the others less the first",
     )
@@ -39,6 +40,20 @@ pub struct Args {
     /// (not the sigmoid), one map for each frame in the order of the split.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["weights", "allow_partial", "height", "width", "flip"])]
     disparities: Option<PathBuf>,
+    /// Measure what another program predicted: a folder of depth maps, matched with the frames by their names:
+    /// 16-bit PNGs of metres times 256, or .npy `[height, width]`; `_depth` may stand before the ending.
+    ///
+    /// KITTI raw: FOLDER/image_02/data/0000000005.png, or without data/; other folders: as the frames. What `predict`
+    /// writes for the same folder fits.
+    #[arg(long, value_name = "DIR")]
+    #[arg(conflicts_with_all = ["weights", "disparities", "allow_partial", "height", "width", "flip"])]
+    predictions: Option<PathBuf>,
+    /// The .npy files of --predictions hold inverse depth, as `predict --npy` writes it [default: depth].
+    #[arg(long, requires = "predictions")]
+    inverse: bool,
+    /// Pass over files of --predictions that are of no frame that is measured [default: they are an error].
+    #[arg(long, requires = "predictions")]
+    ignore_extra: bool,
     /// Frames to measure on: `street` (with a seed that no run trains on) or a folder: in
     /// the layout of KITTI raw, or (where the protocol is not KITTI's) of frames with depth maps, as train takes them.
     #[arg(long, value_name = "street|DIR", default_value = "street")]
@@ -97,7 +112,7 @@ pub struct Args {
     plot: Option<PathBuf>,
     /// Print one JSON object: what was measured, how, and the metrics of all and of each image.
     ///
-    /// weights or disparities, data, split, protocol, scale, flip, precision, height, width (of the predictions), frames, images
+    /// weights, disparities or predictions, data, split, protocol, scale, flip, precision, height, width (of the predictions), frames, images
     /// (those that were measured), skipped: [{why, frames, first}], abs_rel, sq_rel, rmse, rmse_log, a1, a2, a3,
     /// ratio_median, ratio_std, per_image, without_pixels, without_depth, without_scale,
     /// sequences (of each image), interval: {unit, units, replicates, low, high}, distances, regions, sets, others (further
@@ -110,7 +125,11 @@ pub struct Args {
 enum By {
     Network(Box<Predictor>),
     File(Predictions),
+    Folder(PathBuf),
 }
+
+/// The size at which pictures are shown of which a folder holds the predictions.
+const SHOWN: (usize, usize) = (192, 640);
 
 /// Something that predicts, and what it is called.
 struct Candidate {
@@ -139,13 +158,16 @@ pub fn run(args: Args) -> Result<()> {
         }
         let (data, lacking) = source::open(&args, height, width)?;
         left_out = lacking;
+        let (by, (height, width)) = candidate.predicts(&args, data.as_ref())?;
         let mut progress = Progress::new("images", data.len() as u64);
-        let study = candidate.measure(data.as_ref(), &args, &settings, |done| progress.set(done as u64, ""))?;
+        let how = args.evaluation();
+        let study = study(by.as_ref(), data.as_ref(), how, &settings, |done| progress.set(done as u64, ""))?;
         progress.finish();
         if let (Some(folder), true) = (&args.sheets, found.is_empty()) {
-            candidate.draw_worst(folder, &study, data.as_ref(), args.evaluation())?;
+            let written = sheets::write_worst(folder, &study, by.as_ref(), data.as_ref(), how)?;
+            note!("{} sheets of the worst images are in {}", written.len(), folder.display());
         }
-        let (frames, name) = (data.len() + left_out.without_depth, candidate.name);
+        let (frames, name) = (data.len() + left_out.without_depth, candidate.name.clone());
         let difference = found.first().and_then(|first: &One| study.less(&first.study, &settings));
         found.push(One { name, height, width, frames, study, difference });
     }
@@ -175,6 +197,15 @@ impl Args {
             let (height, width) = found.size;
             return Ok(Candidate { name: path.display().to_string(), by: By::File(found), height, width });
         }
+        if let Some(folder) = &self.predictions {
+            if self.data == STREET {
+                let message = "the street's frames have no files to match: write it with `data street --out DIR`, and give \
+                               --data DIR";
+                return Err(Error::setting("predictions", message));
+            }
+            let (height, width) = SHOWN;
+            return Ok(Candidate { name: folder.display().to_string(), by: By::Folder(folder.clone()), height, width });
+        }
         let Weights { model, params, setup, .. } = weights.load()?;
         let predictor = Predictor::new(&model, &params, &setup).with_precision(self.precision.checked()?)?;
         let by = By::Network(Box::new(predictor));
@@ -183,30 +214,23 @@ impl Args {
 }
 
 impl Candidate {
-    fn draw_worst(&self, folder: &Path, study: &Study, data: &dyn DataSource, how: Evaluation) -> Result<()> {
-        let written = match &self.by {
-            By::Network(predictor) => {
-                sheets::write_worst(folder, study, &ByNetwork { predictor, flip: how.flip }, data, how)?
-            }
-            By::File(predictions) => sheets::write_worst(folder, study, predictions, data, how)?,
-        };
-        note!("{} sheets of the worst images are in {}", written.len(), folder.display());
-        Ok(())
-    }
-
-    fn measure(
-        &self,
-        data: &dyn DataSource,
-        args: &Args,
-        settings: &Settings,
-        seen: impl FnMut(usize),
-    ) -> Result<Study> {
-        let how = args.evaluation();
+    /// What predicts the frames of some data, and the rows and columns of its maps (of a folder, its first one's).
+    fn predicts<'a>(&'a self, args: &Args, data: &dyn DataSource) -> Result<(Box<dyn Predicts + 'a>, (usize, usize))> {
+        let size = (self.height, self.width);
         match &self.by {
-            By::Network(predictor) => study(&ByNetwork { predictor, flip: how.flip }, data, how, settings, seen),
+            By::Network(predictor) => Ok((Box::new(ByNetwork { predictor, flip: args.flip }), size)),
             By::File(predictions) => {
                 predictions.check(data.len())?;
-                study(predictions, data, how, settings, seen)
+                Ok((Box::new(predictions), size))
+            }
+            By::Folder(folder) => {
+                let holds = if args.inverse { Holds::InverseDepth } else { Holds::Depth };
+                let found = PredictionFolder::open(folder, data, holds, args.ignore_extra)?;
+                if !found.extra().is_empty() {
+                    note!("{} predictions are of other frames and are passed over", found.extra().len());
+                }
+                let (_, size) = found.inverse_depth(data, 0)?;
+                Ok((Box::new(found), size))
             }
         }
     }

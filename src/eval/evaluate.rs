@@ -31,6 +31,12 @@ pub trait Predicts {
     fn inverse_depth(&self, data: &dyn DataSource, sample: usize) -> Result<(Vec<f32>, (usize, usize))>;
 }
 
+impl<P: Predicts + ?Sized> Predicts for &P {
+    fn inverse_depth(&self, data: &dyn DataSource, sample: usize) -> Result<(Vec<f32>, (usize, usize))> {
+        (**self).inverse_depth(data, sample)
+    }
+}
+
 /// A network.
 pub struct ByNetwork<'a> {
     /// It.

@@ -8,6 +8,7 @@ pub mod compare;
 pub mod csv;
 pub mod evaluate;
 pub mod flip;
+pub mod folder;
 pub mod mean_map;
 pub mod metrics;
 pub mod predictions;

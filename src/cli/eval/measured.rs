@@ -20,6 +20,7 @@ use crate::cli::sizes::Numbers;
 pub struct Measured {
     weights: Option<String>,
     disparities: Option<PathBuf>,
+    predictions: Option<PathBuf>,
     data: String,
     split: Option<PathBuf>,
     protocol: Protocol,
@@ -112,10 +113,11 @@ impl Measured {
     /// What was measured, as it was asked for; of several, the first is what the others are compared with.
     pub fn new(args: &Args, mut found: Vec<One>, left_out: &LeftOut) -> Measured {
         let first = found.remove(0);
-        let of_weights = args.disparities.is_none();
+        let of_weights = args.disparities.is_none() && args.predictions.is_none();
         Measured {
             weights: of_weights.then(|| first.name.clone()),
             disparities: args.disparities.clone(),
+            predictions: args.predictions.clone(),
             data: match args.data.as_str() {
                 STREET => format!("street of seed {}", args.seed),
                 folder => folder.to_owned(),
