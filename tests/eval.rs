@@ -287,3 +287,29 @@ fn a_folder_of_predictions_is_matched_by_name() {
     fails(&missing, 1, &["1 of 2 frames have no prediction", &format!("{DRIVE} 1 l"), "0000000001.png or .npy"]);
     fails(&["eval", "--predictions", text(&depth)], 2, &["--predictions", "data street"]);
 }
+
+#[test]
+fn trajectories_are_compared() {
+    let (street, _) = made();
+    let place = tempfile::tempdir().expect("a folder");
+    let truth = street.join(DRIVE).join("poses.txt");
+    let [half, plot] = ["half.txt", "path.svg"].map(|name| place.path().join(name));
+    // The same path in half the unit.
+    let lines = std::fs::read_to_string(&truth).expect("poses");
+    let halved = lines.lines().map(|line| {
+        let numbers = line.split(' ').map(|n| n.parse::<f64>().expect("a number")).enumerate();
+        let numbers = numbers.map(|(i, n)| if i % 4 == 3 { n / 2.0 } else { n }.to_string());
+        numbers.collect::<Vec<_>>().join(" ") + "\n"
+    });
+    std::fs::write(&half, halved.collect::<String>()).expect("written");
+    let flags = ["eval", "--poses", text(&truth), "--trajectory", text(&half), "--plot", text(&plot)];
+    let json: serde_json::Value = serde_json::from_str(&said(&[&flags[..], &["--json"]].concat())).expect("JSON");
+    let number = |value: &serde_json::Value| value.as_f64().expect("a number");
+    assert!((number(&json["scale"]) - 2.0).abs() < 1e-9 && number(&json["ate"]) < 1e-9, "{json}");
+    assert!(number(&json["five_frames"]["mean"]) < 1e-9 && json["segments"].is_null(), "{json}");
+    assert!(std::fs::read_to_string(&plot).expect("a plot").contains("from above"));
+    assert!(said(&flags).contains("segments     none"));
+    std::fs::write(&half, lines.lines().take(3).map(|l| format!("{l}\n")).collect::<String>()).expect("written");
+    fails(&flags, 2, &["--trajectory: 3 predicted poses, but 6 true ones"]);
+    fails(&["eval", "--poses", text(&truth)], 2, &["--trajectory"]);
+}

@@ -23,12 +23,13 @@ use super::sizes::Numbers;
 use measured::{Measured, One};
 
 mod measured;
+mod poses;
 mod sheets;
 mod source;
 
 #[derive(clap::Args)]
 #[command(mut_arg("weights", |weights| {
-    weights.required(false).required_unless_present_any(["disparities", "predictions"]).num_args(1..).help(
+    weights.required(false).required_unless_present_any(["disparities", "predictions", "poses"]).num_args(1..).help(
         "Weights: a run's folder (its best weights), a file (.safetensors, .pth, .npz), or a folder with encoder.pth, \
          depth.pth, ...; several networks (A B C) are set beside each other, the others less the first",
     )
@@ -54,6 +55,17 @@ pub struct Args {
     /// Pass over files of --predictions that are of no frame that is measured [default: they are an error].
     #[arg(long, requires = "predictions")]
     ignore_extra: bool,
+    /// Compare trajectories instead: the true poses, twelve numbers a line (the rows of [R | C]) as KITTI odometry's
+    /// poses/09.txt.
+    ///
+    /// Five-frame error (mean of sqrt(sum of squares) / 5), ATE after a similarity (Umeyama), KITTI's segment errors;
+    /// --plot draws both from above.
+    #[arg(long, value_name = "FILE", requires = "trajectory")]
+    #[arg(conflicts_with_all = ["weights", "disparities", "predictions", "split", "flip", "csv", "sheets", "details"])]
+    poses: Option<PathBuf>,
+    /// The predicted poses to compare with --poses, in the same form, one for each frame.
+    #[arg(long, value_name = "FILE", requires = "poses")]
+    trajectory: Option<PathBuf>,
     /// Frames to measure on: `street` (with a seed that no run trains on) or a folder: in
     /// the layout of KITTI raw, or (where the protocol is not KITTI's) of frames with depth maps, as train takes them.
     #[arg(long, value_name = "street|DIR", default_value = "street")]
@@ -107,7 +119,7 @@ pub struct Args {
     /// Each with its picture, predicted and true depth in one scale of colours, and relative error.
     #[arg(long, value_name = "DIR", help_heading = "More than a mean")]
     sheets: Option<PathBuf>,
-    /// Draw Abs Rel by distance, as SVG.
+    /// Draw Abs Rel by distance (of trajectories, both from above), as SVG.
     #[arg(long, value_name = "FILE", help_heading = "More than a mean")]
     plot: Option<PathBuf>,
     /// Print one JSON object: what was measured, how, and the metrics of all and of each image.
@@ -140,6 +152,9 @@ struct Candidate {
 }
 
 pub fn run(args: Args) -> Result<()> {
+    if let (Some(truth), Some(predicted)) = (&args.poses, &args.trajectory) {
+        return poses::run(&args, truth, predicted);
+    }
     let settings =
         Settings { bins: args.bins.clone().unwrap_or(BINS.to_vec()), replicates: args.bootstrap, seed: args.seed };
     let mut found: Vec<One> = Vec::new();

@@ -1,5 +1,6 @@
 //! Depth of pictures, and how good it is: prediction, protocols and metrics, scale from the camera's height, attention maps.
 
+pub mod alignment;
 pub mod attention;
 pub mod bootstrap;
 pub mod breakdown;
@@ -18,3 +19,4 @@ pub mod protocol;
 pub mod scale;
 pub mod statistics;
 pub mod study;
+pub mod trajectory;
