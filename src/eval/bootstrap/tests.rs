@@ -36,7 +36,9 @@ fn intervals_of_images_approach_those_of_all_possible_draws() {
         }
     }
     assert_eq!(bootstrap.intervals(&metrics(&values)), Some(found), "the same seed draws the same");
-    assert_ne!(Bootstrap::new(&[0; 5], 20_000, 4).intervals(&metrics(&values)), Some(found));
+    // The ends of many draws of five values are the exact ones for any seed; those of a few differ.
+    let few = |seed| Bootstrap::new(&[0; 5], 20, seed).intervals(&metrics(&values));
+    assert_ne!(few(3), few(4));
 }
 
 #[test]

@@ -33,7 +33,8 @@ fn published() -> Vec<Published> {
         ten: false,
     };
     let known = |_: usize, _: usize, z: f64| z > 0.0;
-    let cityscapes = |r: usize, c: usize, z: f64| r >= 256 && r < 768 && c >= 192 && c < 1856 && z > 0.001 && z < 80.0;
+    let cityscapes =
+        |r: usize, c: usize, z: f64| (256..768).contains(&r) && (192..1856).contains(&c) && z > 0.001 && z < 80.0;
     vec![
         usual(Protocol::Dense, (40, 70), |_, _, z| z > 0.001 && z < 80.0),
         usual(Protocol::Eigen, (375, 1242), |r, c, z| garg(r, c) && z > 0.001 && z < 80.0),
@@ -49,7 +50,7 @@ fn published() -> Vec<Published> {
             nearest: true,
             cut: (0.0, 70.0),
             ten: true,
-            ..usual(Protocol::Make3d, (55, 305), |r, _, z| r >= 17 && r < 38 && z > 0.0 && z < 70.0)
+            ..usual(Protocol::Make3d, (55, 305), |r, _, z| (17..38).contains(&r) && z > 0.0 && z < 70.0)
         },
         Published { shown: (0, 768), ..usual(Protocol::Cityscapes, (1024, 2048), cityscapes) },
     ]
