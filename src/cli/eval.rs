@@ -98,7 +98,7 @@ pub struct Args {
     /// Numbers in which products are taken; bf16 where the processor has AVX-512 BF16.
     #[arg(long, value_enum, default_value = "f32")]
     precision: Numbers,
-    /// Seed of the street.
+    /// Seed of the street, and of the draws for intervals.
     #[arg(long, value_name = "N", default_value_t = 3_000_000)]
     seed: u64,
     /// How often images are drawn again for the 95 % intervals of the means (percentile bootstrap; whole sequences
