@@ -259,8 +259,8 @@ fn more_than_a_mean_is_written_and_weights_stand_beside_each_other() {
         assert!(table.contains(part), "{part}: {table}");
     }
     fails(&[&flags[..], &["--bins", "10,5"]].concat(), 2, &["--bins: expected metres from 0 up"]);
-    let small = ["eval", "--weights", text(weights), text(&other), "--height", "32", "--bootstrap", "0"];
-    assert!(!said(&[&small[..], &["--width", "32"]].concat()).contains("intervals"));
+    let small = ["eval", "--data", text(&street), "--weights", text(weights), "--height", "64", "--bootstrap", "0"];
+    assert!(!said(&[&small[..], &["--width", "64"]].concat()).contains("intervals"));
 }
 
 #[test]

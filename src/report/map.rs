@@ -31,6 +31,19 @@ pub fn draw_values(
     })
 }
 
+/// Draws a map that is known everywhere, row-major, `(height, width)`, into a picture of `size`, as [`draw_values`].
+///
+/// # Panics
+/// If the map is not that large.
+pub fn draw_map(map: &[f64], (height, width): (usize, usize), (w, h): (u32, u32), [low, high]: [f64; 2]) -> RgbImage {
+    assert!(map.len() == height * width && !map.is_empty(), "draw_map: a map of {width}x{height} expected");
+    let range = if high > low { high - low } else { 1.0 };
+    RgbImage::from_fn(w, h, |x, y| {
+        let (row, column) = (y as usize * height / h as usize, x as usize * width / w as usize);
+        magma(((map[row * width + column] - low) / range) as f32)
+    })
+}
+
 /// The known value nearest to a pixel, at most `reach` pixels away along either axis.
 fn nearest(known: &[Option<f64>], (w, h): (u32, u32), [x, y]: [u32; 2], reach: u32) -> Option<f64> {
     let at = |x: u32, y: u32| known[y as usize * w as usize + x as usize];
@@ -65,6 +78,12 @@ mod tests {
         assert_eq!(at(2, 0), MAGMA[255]);
         let half = draw_values([(9, 9, 1.0)], (10, 10), (5, 5), [1.0, 1.0], 0);
         assert_eq!((half.get_pixel(4, 4).0, half.get_pixel(3, 3).0), (MAGMA[0], UNKNOWN.0));
+    }
+
+    #[test]
+    fn a_small_map_fills_its_picture() {
+        let picture = draw_map(&[0.0, 2.0], (1, 2), (6, 3), [0.0, 2.0]);
+        assert_eq!((picture.get_pixel(2, 2).0, picture.get_pixel(3, 0).0), (MAGMA[0], MAGMA[255]));
     }
 
     #[test]

@@ -12,7 +12,7 @@ use parallax::eval::evaluate::{Evaluation, Outcome, Predicts, compare_sample};
 use parallax::eval::statistics::quantile;
 use parallax::eval::study::Study;
 use parallax::formats::png::write_png;
-use parallax::report::map::{colour_bar, draw_values};
+use parallax::report::map::{colour_bar, draw_map, draw_values};
 
 use crate::cli::sheet::write;
 
@@ -67,7 +67,7 @@ fn sheet(
     let mut inverse_truth: Vec<f64> = compared.pairs.iter().map(|pair| 1.0 / pair.truth).collect();
     inverse_truth.sort_unstable_by(f64::total_cmp);
     let [far, near] = [0.0, 0.95].map(|part| quantile(&inverse_truth, part).unwrap_or(1.0));
-    let prediction = inverse.iter().enumerate().map(|(i, &d)| (i / size.1, i % size.1, f64::from(d) / compared.factor));
+    let prediction: Vec<f64> = inverse.iter().map(|&d| f64::from(d) / compared.factor).collect();
     // Holes of a dense truth stay holes; the points of a scan are spread.
     let dense = compared.pairs.len() * 3 > compared.size.0 * compared.size.1;
     let reach = if dense { 0 } else { 2 };
@@ -78,8 +78,7 @@ fn sheet(
     let error = |pair: &Pair| (pair.truth - pair.prediction).abs() / pair.truth;
     let panels = [
         ("picture", lanczos(picture, panel.0, panel.1)),
-        // A prediction smaller than the panel leaves gaps, which its own pixels fill.
-        ("predicted depth", draw_values(prediction, size, panel, [far, near], panel.0.div_ceil(size.1 as u32))),
+        ("predicted depth", draw_map(&prediction, size, panel, [far, near])),
         ("true depth, where it counts", values(&|pair| 1.0 / pair.truth, [far, near])),
         ("relative error |g - p| / g", values(&error, [0.0, LARGEST_ERROR])),
     ];
