@@ -49,6 +49,8 @@ pub enum Stream {
     Rotations(u64),
     /// The rotations that go on beside a training step.
     KeptRotations(u64),
+    /// The images that a bootstrap interval is made of.
+    Bootstrap,
 }
 
 impl Stream {
@@ -63,6 +65,7 @@ impl Stream {
             Stream::InputDirections(input) => 0xD12 + input,
             Stream::Weights => 0x1417,
             Stream::CaseInputs => 0xCA5E,
+            Stream::Bootstrap => 0xB007,
             Stream::Order(epoch) => each(1, epoch),
             Stream::Augmentation(step) => each(2, step),
             Stream::TiePool => each(3, 0) - 1,
@@ -182,6 +185,7 @@ mod tests {
         let last = (1 << 40) - 2;
         let mut all = vec![Stream::Only, Stream::FixedInputs, Stream::TaylorDirections, Stream::Cotangents];
         all.extend([Stream::Weights, Stream::CaseInputs, Stream::TiePool, Stream::RotationDropout]);
+        all.push(Stream::Bootstrap);
         all.extend([0, 1, 200].map(Stream::InputDirections));
         for family in [Stream::Order, Stream::Augmentation, Stream::Ties] {
             all.extend([0, 1, last].map(family));

@@ -1,24 +1,39 @@
 //! `parallax eval`.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use parallax::Result;
 use parallax::data::DataSource;
-use parallax::data::camera::Camera;
-use parallax::data::frames::{self, Frames};
-use parallax::data::kitti::{DepthAxis, GroundTruth, Kitti, LeftOut, Options, is_kitti};
-use parallax::eval::metrics::{Protocol, Report, STEREO_SCALE, Scale};
+use parallax::data::kitti::LeftOut;
+use parallax::eval::breakdown::BINS;
+use parallax::eval::csv;
+use parallax::eval::evaluate::{ByNetwork, Evaluation, Predicts};
+use parallax::eval::folder::{Holds, PredictionFolder};
 use parallax::eval::predictions::Predictions;
-use parallax::eval::predictor::{Evaluation, Predictor, evaluate, evaluate_predictions};
-use parallax::street::{Street, StreetConfig};
+use parallax::eval::predictor::Predictor;
+use parallax::eval::protocol::Protocol;
+use parallax::eval::scale::Scale;
+use parallax::eval::study::{Settings, study};
+use parallax::formats::atomic::write_bytes_atomically;
+use parallax::train::data::STREET;
 use parallax::weights::Weights;
-use serde::Serialize;
+use parallax::{Error, Result};
 
 use super::progress::Progress;
 use super::sizes::Numbers;
+use measured::{Measured, One};
+
+mod measured;
+mod poses;
+mod sheets;
+mod source;
 
 #[derive(clap::Args)]
-#[command(mut_arg("weights", |weights| weights.required(false).required_unless_present("disparities")))]
+#[command(mut_arg("weights", |weights| {
+    weights.required(false).required_unless_present_any(["disparities", "predictions", "poses"]).num_args(1..).help(
+        "Weights: a run's folder (its best weights), a file (.safetensors, .pth, .npz), or a folder with encoder.pth, \
+         depth.pth, ...; several networks (A B C) are set beside each other, the others less the first",
+    )
+}))]
 pub struct Args {
     #[command(flatten)]
     weights: super::weights::WeightsArgs,
@@ -26,17 +41,55 @@ pub struct Args {
     /// (not the sigmoid), one map for each frame in the order of the split.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["weights", "allow_partial", "height", "width", "flip"])]
     disparities: Option<PathBuf>,
+    /// Measure what another program predicted: a folder of depth maps, matched with the frames by their names:
+    /// 16-bit PNGs of metres times 256, or .npy `[height, width]`; `_depth` may stand before the ending.
+    ///
+    /// KITTI raw: FOLDER/image_02/data/0000000005.png, or without data/; other folders: as the frames. What `predict`
+    /// writes for the same folder fits.
+    #[arg(long, value_name = "DIR")]
+    #[arg(conflicts_with_all = ["weights", "disparities", "allow_partial", "height", "width", "flip"])]
+    predictions: Option<PathBuf>,
+    /// The .npy files of --predictions hold inverse depth, as `predict --npy` writes it [default: depth].
+    #[arg(long, requires = "predictions")]
+    inverse: bool,
+    /// Pass over files of --predictions that are of no frame that is measured [default: they are an error].
+    #[arg(long, requires = "predictions")]
+    ignore_extra: bool,
+    /// Compare trajectories instead: the true poses, twelve numbers a line (the rows of [R | C]) as KITTI odometry's
+    /// poses/09.txt.
+    ///
+    /// Five-frame error (mean of sqrt(sum of squares) / 5), ATE after a similarity (Umeyama), KITTI's segment errors;
+    /// --plot draws both from above.
+    #[arg(long, value_name = "FILE", requires = "trajectory")]
+    #[arg(conflicts_with_all = ["weights", "disparities", "predictions", "split", "flip", "csv", "sheets", "details"])]
+    poses: Option<PathBuf>,
+    /// The predicted poses to compare with --poses, in the same form, one for each frame.
+    #[arg(long, value_name = "FILE", requires = "poses")]
+    trajectory: Option<PathBuf>,
     /// Frames to measure on: `street` (with a seed that no run trains on) or a folder: in
-    /// the layout of KITTI raw, or (protocol dense) of frames with depth maps, as train takes them.
+    /// the layout of KITTI raw, or (where the protocol is not KITTI's) of frames with depth maps, as train takes them.
     #[arg(long, value_name = "street|DIR", default_value = "street")]
     data: String,
     /// List of a folder's frames, lines `FOLDER FRAME SIDE` [default: all].
     #[arg(long, value_name = "FILE")]
     split: Option<PathBuf>,
-    /// Which pixels count: dense, eigen, eigen-camera-z, improved.
-    #[arg(long, default_value = "dense", value_parser = |s: &str| s.parse::<Protocol>().map_err(|e| e.to_string()))]
+    /// Which pixels count, against which ground truth.
+    ///
+    /// dense              0.001 to 80 m, the whole picture: truth without holes
+    /// eigen              within Garg's crop; LiDAR scans, whose x is the depth (the tables of the literature)
+    /// eigen-camera-z     the same, the camera's z is the depth
+    /// improved           every pixel of KITTI's improved ground truth
+    /// projected          as eigen, scans projected beforehand: DRIVE/proj_depth/velodyne/image_02/FRAME.npz
+    /// make3d             C1: up to 70 m, rows 17 to 38 of the grid's 55, log10; the picture is its central 2:1
+    /// drivingstereo      every pixel, no crop; drivingstereo-garg: within Garg's crop
+    /// kitti2015          every pixel, no crop
+    /// middlebury         every pixel, no crop
+    /// cityscapes         0.001 to 80 m, rows 256 to 768, columns 192 to 1856
+    #[arg(long, verbatim_doc_comment, default_value = "dense")]
+    #[arg(value_parser = |s: &str| s.parse::<Protocol>().map_err(|e| e.to_string()))]
     protocol: Protocol,
-    /// How predictions get their scale: median, stereo, or a factor.
+    /// How predictions get their scale: median (of each image's ground truth), stereo (times 5.4), camera-height (what
+    /// makes the camera hang 1.65 m over the road that is seen; camera-height=METRES for another), or a factor.
     #[arg(long, default_value = "median", value_parser = |s: &str| s.parse::<Scale>().map_err(|e| e.to_string()))]
     scale: Scale,
     /// Flip post-processing: predict on the mirrored picture too, and join both.
@@ -45,14 +98,37 @@ pub struct Args {
     /// Numbers in which products are taken; bf16 where the processor has AVX-512 BF16.
     #[arg(long, value_enum, default_value = "f32")]
     precision: Numbers,
-    /// Seed of the street.
+    /// Seed of the street, and of the draws for intervals.
     #[arg(long, value_name = "N", default_value_t = 3_000_000)]
     seed: u64,
+    /// How often images are drawn again for the 95 % intervals of the means (percentile bootstrap; whole sequences
+    /// where there are several); 0: no intervals.
+    #[arg(long, value_name = "N", default_value_t = 1000, help_heading = "More than a mean")]
+    bootstrap: usize,
+    /// Where bins of true distance begin, in metres, with commas [default: 0,5,10,20,30,40,60,80].
+    #[arg(long, value_name = "METRES", value_delimiter = ',', help_heading = "More than a mean")]
+    bins: Option<Vec<f64>>,
+    /// Also print errors by distance, by ninths of the picture, and by sequence.
+    #[arg(long, help_heading = "More than a mean")]
+    details: bool,
+    /// Write the metrics of every image into a table of comma-separated values.
+    #[arg(long, value_name = "FILE", help_heading = "More than a mean")]
+    csv: Option<PathBuf>,
+    /// Draw the ten images with the largest Abs Rel (of the first weights) into a folder: 01.png the worst.
+    ///
+    /// Each with its picture, predicted and true depth in one scale of colours, and relative error.
+    #[arg(long, value_name = "DIR", help_heading = "More than a mean")]
+    sheets: Option<PathBuf>,
+    /// Draw Abs Rel by distance (of trajectories, both from above), as SVG.
+    #[arg(long, value_name = "FILE", help_heading = "More than a mean")]
+    plot: Option<PathBuf>,
     /// Print one JSON object: what was measured, how, and the metrics of all and of each image.
     ///
-    /// weights or disparities, data, split, protocol, scale, flip, precision, height, width (of the predictions), frames, images
+    /// weights, disparities or predictions, data, split, protocol, scale, flip, precision, height, width (of the predictions), frames, images
     /// (those that were measured), skipped: [{why, frames, first}], abs_rel, sq_rel, rmse, rmse_log, a1, a2, a3,
-    /// ratio_median, ratio_std, per_image, without_pixels, without_depth.
+    /// ratio_median, ratio_std, per_image, without_pixels, without_depth, without_scale,
+    /// sequences (of each image), interval: {unit, units, replicates, low, high}, distances, regions, sets, others (further
+    /// weights: the same, and their difference from the first).
     #[arg(long, verbatim_doc_comment)]
     json: bool,
 }
@@ -61,171 +137,116 @@ pub struct Args {
 enum By {
     Network(Box<Predictor>),
     File(Predictions),
+    Folder(PathBuf),
 }
 
-/// What was measured, and what came out.
-#[derive(Serialize)]
-struct Measured {
-    weights: Option<String>,
-    disparities: Option<PathBuf>,
-    data: String,
-    split: Option<PathBuf>,
-    protocol: Protocol,
-    scale: String,
-    flip: bool,
-    precision: Option<Numbers>,
+/// The size at which pictures are shown of which a folder holds the predictions.
+const SHOWN: (usize, usize) = (192, 640);
+
+/// Something that predicts, and what it is called.
+struct Candidate {
+    name: String,
+    by: By,
     height: usize,
     width: usize,
-    /// All that were looked at: those that were measured, and those that were not.
-    frames: usize,
-    skipped: Vec<Skipped>,
-    #[serde(flatten)]
-    report: Report,
-}
-
-/// Frames that are in none of the numbers.
-#[derive(Serialize)]
-struct Skipped {
-    why: &'static str,
-    frames: usize,
-    first: Option<String>,
-}
-
-/// The frames that are not in a report, by why.
-fn skipped(report: &Report, left_out: &LeftOut) -> Vec<Skipped> {
-    let listed = |why, names: &[String]| Skipped { why, frames: names.len(), first: names.first().cloned() };
-    let missing = left_out.first_depth.as_ref().map(|path| path.display().to_string());
-    let all = [
-        Skipped { why: "no ground-truth depth", frames: left_out.without_depth, first: missing },
-        listed("no ground-truth depth", &report.without_depth),
-        listed("no pixel of the ground truth counts under this protocol", &report.without_pixels),
-    ];
-    all.into_iter().filter(|skipped| skipped.frames > 0).collect()
 }
 
 pub fn run(args: Args) -> Result<()> {
-    let (by, (height, width)) = match &args.disparities {
-        Some(path) => {
-            let found = Predictions::read(path)?;
-            let size = found.size;
-            (By::File(found), size)
+    if let (Some(truth), Some(predicted)) = (&args.poses, &args.trajectory) {
+        return poses::run(&args, truth, predicted);
+    }
+    let settings =
+        Settings { bins: args.bins.clone().unwrap_or(BINS.to_vec()), replicates: args.bootstrap, seed: args.seed };
+    let mut found: Vec<One> = Vec::new();
+    let mut left_out = LeftOut::default();
+    for weights in args.weights.each() {
+        let candidate = args.candidate(&weights)?;
+        let (height, width) = (candidate.height, candidate.width);
+        if let Some(first) = found.first().filter(|first| (first.height, first.width) != (height, width))
+            && args.data == STREET
+        {
+            let message = format!(
+                "{} sees pictures of {height}x{width}, {} of {}x{}: give --height and --width, so that both see one street",
+                candidate.name, first.name, first.height, first.width
+            );
+            return Err(Error::setting("weights", message));
         }
-        None => {
-            let Weights { model, params, setup, .. } = args.weights.load()?;
-            let predictor = Predictor::new(&model, &params, &setup).with_precision(args.precision.checked()?)?;
-            (By::Network(Box::new(predictor)), (setup.height, setup.width))
+        let (data, lacking) = source::open(&args, height, width)?;
+        left_out = lacking;
+        let (by, (height, width)) = candidate.predicts(&args, data.as_ref())?;
+        let mut progress = Progress::new("images", data.len() as u64);
+        let how = args.evaluation();
+        let study = study(by.as_ref(), data.as_ref(), how, &settings, |done| progress.set(done as u64, ""))?;
+        progress.finish();
+        if let (Some(folder), true) = (&args.sheets, found.is_empty()) {
+            let written = sheets::write_worst(folder, &study, by.as_ref(), data.as_ref(), how)?;
+            note!("{} sheets of the worst images are in {}", written.len(), folder.display());
         }
-    };
-    let (data, left_out) = args.open(height, width)?;
-    let mut progress = Progress::new("images", data.len() as u64);
-    let how = Evaluation { protocol: args.protocol, scale: args.scale, flip: args.flip };
-    let seen = |done| progress.set(done as u64, "");
-    let report = match &by {
-        By::Network(predictor) => {
-            let samples: Vec<usize> = (0..data.len()).collect();
-            evaluate(predictor, data.as_ref(), &samples, how, seen)?
-        }
-        By::File(predictions) => evaluate_predictions(predictions, data.as_ref(), how, seen)?,
-    };
-    progress.finish();
-    let precision = args.disparities.is_none().then_some(args.precision);
-    let measured = Measured {
-        weights: args.disparities.is_none().then(|| args.weights.name()),
-        disparities: args.disparities,
-        data: match args.data.as_str() {
-            "street" => format!("street of seed {}", args.seed),
-            folder => folder.to_owned(),
-        },
-        split: args.split,
-        protocol: args.protocol,
-        scale: args.scale.to_string(),
-        flip: args.flip,
-        precision,
-        height,
-        width,
-        frames: data.len() + left_out.without_depth,
-        skipped: skipped(&report, &left_out),
-        report,
-    };
+        let (frames, name) = (data.len() + left_out.without_depth, candidate.name.clone());
+        let difference = found.first().and_then(|first: &One| study.less(&first.study, &settings));
+        found.push(One { name, height, width, frames, study, difference });
+    }
+    let measured = Measured::new(&args, found, &left_out);
+    if let Some(path) = &args.csv {
+        csv::write(path, &measured.studies())?;
+    }
+    if let Some(path) = &args.plot {
+        write_bytes_atomically(path, measured.plot().svg().as_bytes())?;
+    }
     if args.json {
         return super::print_json(&measured);
     }
-    print(&measured, args.scale);
+    measured.print(args.details);
     Ok(())
 }
 
-fn print(measured: &Measured, scale: Scale) {
-    let Measured { report, height, width, .. } = measured;
-    let flipped = if measured.flip { ", joined with the mirrored picture's" } else { "" };
-    let numbers = if measured.precision == Some(Numbers::Bf16) { ", products in bf16" } else { "" };
-    match (&measured.weights, &measured.disparities) {
-        (_, Some(file)) => say!("file      {}, maps of {width}x{height}", file.display()),
-        (weights, None) => {
-            say!("weights   {}, maps of {width}x{height}{flipped}{numbers}", weights.as_deref().unwrap_or_default());
+impl Args {
+    fn evaluation(&self) -> Evaluation {
+        Evaluation { protocol: self.protocol, scale: self.scale, flip: self.flip }
+    }
+
+    /// What predicts: another program's file, or these weights.
+    fn candidate(&self, weights: &super::weights::WeightsArgs) -> Result<Candidate> {
+        if let Some(path) = &self.disparities {
+            let found = Predictions::read(path)?;
+            let (height, width) = found.size;
+            return Ok(Candidate { name: path.display().to_string(), by: By::File(found), height, width });
         }
-    }
-    let listed = measured.split.as_ref().map_or_else(String::new, |list| format!(", frames of {}", list.display()));
-    say!("data      {}{listed}", measured.data);
-    let pixels = match measured.protocol {
-        Protocol::Dense => "0.001 to 80 m, the whole picture",
-        Protocol::Eigen => "0.001 to 80 m within Garg's crop, the LiDAR's x",
-        Protocol::EigenCameraZ => "0.001 to 80 m within Garg's crop, the camera's z",
-        Protocol::Improved => "every pixel of the improved ground truth",
-    };
-    say!("protocol  {}: {pixels}", measured.protocol);
-    match scale {
-        Scale::Median => say!("scaling   each image by the ratio of the medians"),
-        Scale::Stereo => say!("scaling   stereo: times {STEREO_SCALE}"),
-        Scale::Factor(factor) => say!("scaling   times {factor}"),
-    }
-    say!("images    {} of {} frames", report.images, measured.frames);
-    for Skipped { why, frames, first } in &measured.skipped {
-        let first = first.as_ref().map_or_else(String::new, |first| format!(" (the first: {first})"));
-        say!("skipped   {frames}: {why}{first}");
-    }
-    let m = report.metrics;
-    for (name, value) in [
-        ("Abs Rel", m.abs_rel),
-        ("Sq Rel", m.sq_rel),
-        ("RMSE", m.rmse),
-        ("RMSE log", m.rmse_log),
-        ("a1", m.a1),
-        ("a2", m.a2),
-        ("a3", m.a3),
-    ] {
-        say!("{name:9} {value:.4}");
-    }
-    if let (Some(ratio), Some(std)) = (report.ratio_median, report.ratio_std) {
-        say!("scale     median ratio {ratio:.3}, deviation {std:.3}");
+        if let Some(folder) = &self.predictions {
+            if self.data == STREET {
+                let message = "the street's frames have no files to match: write it with `data street --out DIR`, and give \
+                               --data DIR";
+                return Err(Error::setting("predictions", message));
+            }
+            let (height, width) = SHOWN;
+            return Ok(Candidate { name: folder.display().to_string(), by: By::Folder(folder.clone()), height, width });
+        }
+        let Weights { model, params, setup, .. } = weights.load()?;
+        let predictor = Predictor::new(&model, &params, &setup).with_precision(self.precision.checked()?)?;
+        let by = By::Network(Box::new(predictor));
+        Ok(Candidate { name: weights.name(), by, height: setup.height, width: setup.width })
     }
 }
 
-impl Args {
-    /// What is measured on, and which of its frames cannot be.
-    fn open(&self, height: usize, width: usize) -> Result<(Box<dyn DataSource>, LeftOut)> {
-        if self.data == "street" {
-            let street = StreetConfig { height, width, sequences: 8, seed: self.seed, ..StreetConfig::default() };
-            return Ok((Box::new(Street::render(&street, None)), LeftOut::default()));
+impl Candidate {
+    /// What predicts the frames of some data, and the rows and columns of its maps (of a folder, its first one's).
+    fn predicts<'a>(&'a self, args: &Args, data: &dyn DataSource) -> Result<(Box<dyn Predicts + 'a>, (usize, usize))> {
+        let size = (self.height, self.width);
+        match &self.by {
+            By::Network(predictor) => Ok((Box::new(ByNetwork { predictor, flip: args.flip }), size)),
+            By::File(predictions) => {
+                predictions.check(data.len())?;
+                Ok((Box::new(predictions), size))
+            }
+            By::Folder(folder) => {
+                let holds = if args.inverse { Holds::InverseDepth } else { Holds::Depth };
+                let found = PredictionFolder::open(folder, data, holds, args.ignore_extra)?;
+                if !found.extra().is_empty() {
+                    note!("{} predictions are of other frames and are passed over", found.extra().len());
+                }
+                let (_, size) = found.inverse_depth(data, 0)?;
+                Ok((Box::new(found), size))
+            }
         }
-        let root = Path::new(&self.data);
-        if self.protocol == Protocol::Dense && root.is_dir() && !is_kitti(root)? {
-            let camera = Camera::Fov { degrees: 90.0 };
-            let options = frames::Options { neighbours: false, with_depth: true, camera, ..frames::Options::default() };
-            let frames = Frames::open(root, self.split.as_deref(), [height, width], options)?;
-            // Every frame of a list has depth, or opening failed.
-            let left_out = if self.split.is_some() { LeftOut::default() } else { frames.left_out().clone() };
-            return Ok((Box::new(frames), left_out));
-        }
-        let ground_truth = match self.protocol {
-            Protocol::Eigen => GroundTruth::Lidar(DepthAxis::LidarX),
-            Protocol::EigenCameraZ => GroundTruth::Lidar(DepthAxis::CameraZ),
-            Protocol::Improved | Protocol::Dense => GroundTruth::Improved,
-        };
-        // Depth is compared pixel by pixel: whichever camera took the pictures.
-        let camera = Camera::KittiPublished;
-        let options = Options { neighbours: false, ground_truth, camera, ..Options::default() };
-        let kitti = Kitti::open(root, self.split.as_deref(), height, width, options)?;
-        let left_out = kitti.left_out().clone();
-        Ok((Box::new(kitti), left_out))
     }
 }

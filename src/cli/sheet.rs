@@ -111,7 +111,7 @@ fn legend(sheet: &mut RgbImage) {
 }
 
 /// Writes a line of text, as far as the sheet goes; returns where it ends.
-fn write(sheet: &mut RgbImage, text: &str, x: u32, y: u32) -> u32 {
+pub(super) fn write(sheet: &mut RgbImage, text: &str, x: u32, y: u32) -> u32 {
     const WEIGHT: FontWeight = FontWeight::Regular;
     const HEIGHT: RasterHeight = RasterHeight::Size16;
     let advance = get_raster_width(WEIGHT, HEIGHT) as u32;

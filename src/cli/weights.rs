@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use parallax::Result;
 use parallax::monovit::setup::check_size;
 use parallax::weights;
-use parallax::weights::{Need, Weights};
+use parallax::weights::{Need, Sources, Weights};
 
-#[derive(clap::Args)]
+#[derive(Clone, clap::Args)]
 pub struct WeightsArgs {
     /// Weights: a run's folder (its best weights), a file (.safetensors, .pth, .npz), or a folder with encoder.pth,
     /// depth.pth, ...; several times for several files.
@@ -29,6 +29,19 @@ impl WeightsArgs {
     pub fn name(&self) -> String {
         let names: Vec<_> = self.weights.iter().map(|w| w.to_string_lossy()).collect();
         names.join(", ")
+    }
+
+    /// Every path by itself, where there are several and each holds encoder and decoder of its own; otherwise all together,
+    /// as the files of one network.
+    pub fn each(&self) -> Vec<WeightsArgs> {
+        let alone = |path: &PathBuf| {
+            let networks = Sources::open(std::slice::from_ref(path)).map(|sources| sources.networks());
+            networks.is_ok_and(|found| ["encoder", "depth"].iter().all(|network| found.contains(network)))
+        };
+        if self.weights.len() < 2 || !self.weights.iter().all(alone) {
+            return vec![self.clone()];
+        }
+        self.weights.iter().map(|path| WeightsArgs { weights: vec![path.clone()], ..self.clone() }).collect()
     }
 
     /// The weights that were asked for, to predict depth with.

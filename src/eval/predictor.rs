@@ -1,10 +1,9 @@
-//! Depth of pictures, and how good it is against ground truth.
+//! Depth of single pictures, by networks with weights.
 
 use std::path::Path;
 
-use super::metrics::{MeanMap, Protocol, Report, Scale, evaluate_image, flip_post_process, mirror};
-use super::predictions::Predictions;
-use crate::data::DataSource;
+pub use super::evaluate::{Evaluation, evaluate, evaluate_mean_map, evaluate_predictions};
+use super::flip::{flip_post_process, mirror};
 use crate::data::augment::flip;
 use crate::data::batch::to_tensor;
 use crate::data::resize::lanczos;
@@ -15,17 +14,6 @@ use crate::nn::{Folded, Params};
 use crate::tensor::{Precision, profile};
 use crate::weights::{self, Need, Weights};
 use image::RgbImage;
-
-/// Settings of an evaluation.
-#[derive(Clone, Copy, Debug)]
-pub struct Evaluation {
-    /// Evaluation protocol.
-    pub protocol: Protocol,
-    /// Scaling of predictions.
-    pub scale: Scale,
-    /// Flip post-processing: predict on the mirrored picture too, and join both (Monodepth).
-    pub flip: bool,
-}
 
 /// Depth of single pictures, by the networks with weights in evaluation mode.
 ///
@@ -139,83 +127,6 @@ impl Predictor {
         let mirrored = mirror(&mirrored.values, plain.width);
         InverseDepth { values: flip_post_process(&plain.values, &mirrored, plain.width), ..plain }
     }
-}
-
-/// The seven metrics of a network on a data set; `seen` is told how many samples are done. Samples without ground truth
-/// are passed over and named in the report.
-///
-/// # Errors
-/// If no sample has ground truth, or one cannot be read.
-pub fn evaluate(
-    predictor: &Predictor,
-    data: &dyn DataSource,
-    samples: &[usize],
-    how: Evaluation,
-    seen: impl FnMut(usize),
-) -> Result<Report> {
-    compare(data, samples, how, seen, |sample| {
-        let image = data.image(sample, 0)?;
-        let found = predictor.inverse_depth(&image, how.flip);
-        if !found.is_whole() {
-            return Err(Error::Failed(format!("{}: {}", data.name(sample), predictor.why_not_finite(&image))));
-        }
-        let size = found.size();
-        Ok((found.values, size))
-    })
-}
-
-/// The seven metrics of what another program predicted for every sample of a data set; as [`evaluate`].
-///
-/// # Errors
-/// As [`evaluate`], and if there is not one map for each sample.
-pub fn evaluate_predictions(
-    predictions: &Predictions,
-    data: &dyn DataSource,
-    how: Evaluation,
-    seen: impl FnMut(usize),
-) -> Result<Report> {
-    predictions.check(data.len())?;
-    let samples: Vec<usize> = (0..data.len()).collect();
-    compare(data, &samples, how, seen, |sample| {
-        let map = predictions.map(sample).unwrap_or_default();
-        Ok((map.to_vec(), predictions.size))
-    })
-}
-
-/// The seven metrics of the mean depth map on a data set; as [`evaluate`].
-///
-/// # Errors
-/// As [`evaluate`].
-pub fn evaluate_mean_map(map: &MeanMap, data: &dyn DataSource, samples: &[usize], how: Evaluation) -> Result<Report> {
-    compare(data, samples, how, |_| (), |_| Ok((map.inverse_depth.clone(), map.size)))
-}
-
-/// Compares predictions (inverse depth and its rows and columns) with the ground truth of those samples that have one.
-fn compare(
-    data: &dyn DataSource,
-    samples: &[usize],
-    how: Evaluation,
-    mut seen: impl FnMut(usize),
-    predict: impl Fn(usize) -> Result<(Vec<f32>, (usize, usize))>,
-) -> Result<Report> {
-    let (mut results, mut without_depth) = (Vec::new(), Vec::new());
-    for (i, &sample) in samples.iter().enumerate() {
-        match data.depth(sample)? {
-            Some(truth) => {
-                let (inverse_depth, size) = predict(sample)?;
-                let found = evaluate_image(&inverse_depth, size, &truth, how.protocol, how.scale);
-                let found = found.map_err(|e| Error::Failed(format!("{}: {e}", data.name(sample))))?;
-                results.push((data.name(sample), found));
-            }
-            None => without_depth.push(data.name(sample)),
-        }
-        seen(i + 1);
-    }
-    if results.is_empty() {
-        let message = format!("nothing to evaluate: none of the {} frames has ground-truth depth", samples.len());
-        return Err(Error::Failed(message));
-    }
-    Ok(Report { without_depth, ..Report::new(results)? })
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! Matrix products: the only file that calls faer.
+//! Matrix products: the only file that multiplies with faer.
 //!
 //! faer is always called sequentially, on tiles whose bounds depend on shapes alone: its own parallel product changes
 //! bits with the number of threads. Kernels parallelise over tiles instead.

@@ -140,6 +140,12 @@ impl Sources {
         Sources { tensors: self.tensors.iter().filter(of_it).cloned().collect(), ..self.clone() }
     }
 
+    /// Which of the four networks the files hold something of.
+    pub fn networks(&self) -> Vec<&'static str> {
+        let of = |network: &&str| self.tensors.iter().any(|t| t.name.split('.').next() == Some(*network));
+        NETWORKS.into_iter().filter(of).collect()
+    }
+
     /// Every path that was given, for messages.
     fn all_paths(&self) -> PathBuf {
         let all: Vec<String> = self.paths.iter().map(|p| p.display().to_string()).collect();

@@ -4,6 +4,7 @@ use safetensors::SafeTensors;
 use serde_json::Value;
 
 use super::*;
+use crate::depth::{DepthMap, resize_bilinear};
 use crate::test_support::{f32s, fixture_bytes};
 
 struct Case {
@@ -86,7 +87,6 @@ fn protocols_differ_in_their_pixels() {
     };
     assert!(pixels(Protocol::Eigen) < pixels(Protocol::Dense));
     assert!(pixels(Protocol::Dense) < pixels(Protocol::Improved));
-    assert_eq!(Protocol::Eigen.window(375, 1242), [153..371, 44..1197]);
 }
 
 #[test]
@@ -169,22 +169,6 @@ fn what_cannot_be_compared_is_an_error() {
 }
 
 #[test]
-fn medians_and_names() {
-    assert_eq!(median(vec![3.0, 1.0, 2.0]), Some(2.0));
-    assert_eq!(median(vec![4.0, 1.0, 2.0, 3.0]), Some(2.5));
-    assert_eq!(median(vec![7.0]), Some(7.0));
-    assert_eq!(median(vec![]), None);
-    assert_eq!("eigen-camera-z".parse::<Protocol>().unwrap(), Protocol::EigenCameraZ);
-    assert_eq!(serde_json::to_value(Protocol::EigenCameraZ).unwrap(), "eigen-camera-z");
-    assert_eq!("31.5".parse::<Scale>().unwrap(), Scale::Factor(31.5));
-    assert_eq!("median".parse::<Scale>().unwrap(), Scale::Median);
-    for bad in ["0", "-1", "nan", "inf", "mean"] {
-        assert!(bad.parse::<Scale>().unwrap_err().to_string().contains("median, stereo or a number"));
-    }
-    assert!("kitti".parse::<Protocol>().unwrap_err().to_string().contains("dense, eigen"));
-}
-
-#[test]
 fn resizing_interpolates_between_centres() {
     assert_eq!(resize_bilinear(&[0.0, 4.0], (1, 2), (1, 4)), [0.0, 1.0, 3.0, 4.0]);
     assert_eq!(resize_bilinear(&[0.0, 1.0, 2.0, 3.0], (4, 1), (2, 1)), [0.5, 2.5]);
@@ -211,14 +195,4 @@ fn the_mean_map_averages_inverse_depth() {
     let truth = DepthMap { width: 2, height: 1, metres: vec![5.0, 5.0] };
     let image = evaluate_image(&mean.inverse_depth, mean.size, &truth, Protocol::Dense, Scale::Median).unwrap();
     assert!(image.metrics.unwrap().abs_rel < 1e-6);
-}
-
-#[test]
-fn protocols_and_scales_are_called_what_they_are_chosen_by() {
-    for name in ["dense", "eigen", "eigen-camera-z", "improved"] {
-        assert_eq!(name.parse::<Protocol>().unwrap().to_string(), name);
-    }
-    for name in ["median", "stereo", "5.4"] {
-        assert_eq!(name.parse::<Scale>().unwrap().to_string(), name);
-    }
 }
