@@ -5,6 +5,7 @@ pub mod augment;
 pub mod batch;
 mod cache;
 pub mod camera;
+pub mod camera_fit;
 pub mod check;
 pub mod frames;
 pub mod inputs;
