@@ -1,5 +1,6 @@
 //! Where frames come from: the embedded street, KITTI raw, any folder; and what is done to them before training.
 
+pub mod apart;
 pub mod aside;
 pub mod augment;
 pub mod batch;
@@ -11,6 +12,7 @@ pub mod frames;
 pub mod inputs;
 
 pub mod kitti;
+pub mod prepared;
 pub mod pyramid;
 pub mod resize;
 mod street;
@@ -73,21 +75,29 @@ pub trait DataSource: Send + Sync {
         Place { sequence: 0, frame: sample }
     }
 
+    /// The name of the recording that a sample belongs to: the same whichever list the data were opened with.
+    fn recording(&self, sample: usize) -> String {
+        self.place(sample).sequence.to_string()
+    }
+
     /// Ground-truth depth of the target frame at its own size, where there is one.
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>>;
 }
 
 /// Opens a folder to train on: KITTI raw by its layout ([`kitti`]), or any folder of frames ([`frames`]). Of the samples,
-/// all with both neighbours, those that a list names, or all; pictures come out at `[height, width]` pixels.
+/// all with both neighbours, those that a list names, or all; pictures come out at `[height, width]` pixels, from the file
+/// of [`prepared`] frames that is given, or that lies in the folder.
 ///
 /// # Errors
-/// As [`Kitti::open`](kitti::Kitti::open) and [`Frames::open`](frames::Frames::open).
+/// As [`Kitti::open`](kitti::Kitti::open) and [`Frames::open`](frames::Frames::open), and if prepared frames do not belong to the
+/// folder's ([`Prepared::open`](prepared::Prepared::open)).
 pub fn open_folder(
     root: &Path,
     list: Option<&Path>,
     size: [usize; 2],
     camera: camera::Camera,
     skip_bad_frames: bool,
+    prepared: Option<&Path>,
 ) -> Result<Arc<dyn DataSource>> {
     if root.is_file() {
         let message = "is a file: make a folder of frames of a film, for example with ffmpeg -i FILM -qscale:v 2 -vf \
@@ -100,10 +110,18 @@ pub fn open_folder(
     }
     if kitti::is_kitti(root)? {
         let options = kitti::Options { camera, skip_bad_frames, ..kitti::Options::default() };
-        return Ok(Arc::new(kitti::Kitti::open(root, list, size[0], size[1], options)?));
+        let mut kitti = kitti::Kitti::open(root, list, size[0], size[1], options)?;
+        if let Some(file) = prepared {
+            kitti.pictures_mut().take_from(file, root)?;
+        }
+        return Ok(Arc::new(kitti));
     }
     let options = frames::Options { camera, skip_bad_frames, ..frames::Options::default() };
-    Ok(Arc::new(frames::Frames::open(root, list, size, options)?))
+    let mut frames = frames::Frames::open(root, list, size, options)?;
+    if let Some(file) = prepared {
+        frames.pictures_mut().take_from(file, root)?;
+    }
+    Ok(Arc::new(frames))
 }
 
 /// Some samples of a data set.
@@ -143,6 +161,9 @@ impl DataSource for Subset {
     }
     fn place(&self, sample: usize) -> Place {
         self.data.place(self.samples[sample])
+    }
+    fn recording(&self, sample: usize) -> String {
+        self.data.recording(self.samples[sample])
     }
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {
         self.data.depth(self.samples[sample])

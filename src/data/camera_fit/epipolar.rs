@@ -186,7 +186,7 @@ mod tests {
             let point = [random.uniform(-8.0, 8.0), random.uniform(-2.0, 1.6), random.uniform(5.0, 40.0)];
             let seen = apply(rotation, point);
             let mut to = project(std::array::from_fn(|k| seen[k] + moved[k]));
-            if i % 6 == 0 {
+            if i.is_multiple_of(6) {
                 to = [to[0] + random.uniform(-20.0, 20.0), to[1] + random.uniform(-20.0, 20.0)];
             }
             [project(point), to]
@@ -238,13 +238,13 @@ mod tests {
         // A match that nearly agrees: there the denominator's change counts for nothing.
         for rays in pair.rays.iter().skip(1).take(4) {
             let (_, slope) = pair.residual(rays, &motion, &sideways);
-            for k in 0..5 {
+            for (k, &slope) in slope.iter().enumerate() {
                 let at = |h: f64| {
                     let step = std::array::from_fn(|i| if i == k { h } else { 0.0 });
                     pair.residual(rays, &self::moved(&motion, &sideways, step), &sideways).0
                 };
                 let difference = (at(1e-6) - at(-1e-6)) / 2e-6;
-                assert!((difference - slope[k]).abs() < 0.1 * slope[k].abs() + 6.0, "{k}: {difference} {}", slope[k]);
+                assert!((difference - slope).abs() < 0.1 * slope.abs() + 6.0, "{k}: {difference} {}", slope);
             }
         }
     }

@@ -63,9 +63,8 @@ pub(super) fn solve(mut a: [[f64; 5]; 5], mut b: [f64; 5]) -> Option<[f64; 5]> {
         }
         for i in k + 1..5 {
             let factor = a[i][k] / a[k][k];
-            for j in k..5 {
-                a[i][j] -= factor * a[k][j];
-            }
+            let pivot = a[k];
+            a[i].iter_mut().zip(pivot).skip(k).for_each(|(x, p)| *x -= factor * p);
             b[i] -= factor * b[k];
         }
     }

@@ -199,7 +199,7 @@ impl Kitti {
             cameras: BTreeMap::new(),
             left_out: LeftOut::default(),
             unreadable: Vec::new(),
-            pictures: Pictures::new(height, width, options.cache_bytes)?,
+            pictures: Pictures::new(height, width, options.cache_bytes)?.with_prepared(root)?,
         };
         match split {
             Some(split) => kitti.take_split(root, split)?,
@@ -432,6 +432,10 @@ impl Kitti {
         }
     }
 
+    pub(super) fn pictures_mut(&mut self) -> &mut Pictures<impl Eq + std::hash::Hash + use<>> {
+        &mut self.pictures
+    }
+
     /// As the line of a split list: `FOLDER FRAME SIDE`.
     fn name_of(&self, frame: Frame) -> String {
         format!("{} {} {}", self.drives[frame.drive].folder, frame.number, frame.side.letter())
@@ -538,6 +542,10 @@ impl DataSource for Kitti {
     fn place(&self, sample: usize) -> Place {
         let frame = self.samples[sample];
         Place { sequence: frame.drive, frame: frame.number as usize }
+    }
+
+    fn recording(&self, sample: usize) -> String {
+        self.drives[self.samples[sample].drive].folder.clone()
     }
 
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {
