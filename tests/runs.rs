@@ -514,7 +514,7 @@ fn a_folder_of_frames_trains_and_is_measured() {
     assert!(checked.status.success() && said.contains("14 samples to train on, 2 to be set aside"), "{said}");
     assert!(said.contains("fx 0.9000") && !said.contains("look at this"), "{said}");
     assert!(said.contains("whether the camera fits") || said.contains("the camera fits"), "{said}");
-    assert_eq!(parallax::formats::picture::read_picture(&sheet).expect("a picture").dimensions(), (8 * 320, 3 * 96));
+    assert_eq!(parallax::formats::picture::read_picture(&sheet).expect("a picture").dimensions(), (8 * 320, 4 * 96));
     let bad = data.join("second/f3.jpg");
     let whole = std::fs::read(&bad).expect("a frame");
     std::fs::write(&bad, b"no picture").expect("written");

@@ -99,6 +99,23 @@ pub fn open_folder(
     skip_bad_frames: bool,
     prepared: Option<&Path>,
 ) -> Result<Arc<dyn DataSource>> {
+    let cache_bytes = frames::Options::default().cache_bytes;
+    open_folder_keeping(root, list, size, camera, skip_bad_frames, prepared, cache_bytes)
+}
+
+/// [`open_folder`] with at most so many bytes of resized pictures kept in memory.
+///
+/// # Errors
+/// As [`open_folder`].
+pub fn open_folder_keeping(
+    root: &Path,
+    list: Option<&Path>,
+    size: [usize; 2],
+    camera: camera::Camera,
+    skip_bad_frames: bool,
+    prepared: Option<&Path>,
+    cache_bytes: usize,
+) -> Result<Arc<dyn DataSource>> {
     if root.is_file() {
         let message = "is a file: make a folder of frames of a film, for example with ffmpeg -i FILM -qscale:v 2 -vf \
                        fps=10 FRAMES/%06d.jpg";
@@ -109,14 +126,14 @@ pub fn open_folder(
         return Err(Error::file(root, message));
     }
     if kitti::is_kitti(root)? {
-        let options = kitti::Options { camera, skip_bad_frames, ..kitti::Options::default() };
+        let options = kitti::Options { camera, skip_bad_frames, cache_bytes, ..kitti::Options::default() };
         let mut kitti = kitti::Kitti::open(root, list, size[0], size[1], options)?;
         if let Some(file) = prepared {
             kitti.pictures_mut().take_from(file, root)?;
         }
         return Ok(Arc::new(kitti));
     }
-    let options = frames::Options { camera, skip_bad_frames, ..frames::Options::default() };
+    let options = frames::Options { camera, skip_bad_frames, cache_bytes, ..frames::Options::default() };
     let mut frames = frames::Frames::open(root, list, size, options)?;
     if let Some(file) = prepared {
         frames.pictures_mut().take_from(file, root)?;

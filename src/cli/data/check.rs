@@ -25,7 +25,8 @@ pub struct Args {
     split: Option<PathBuf>,
     #[command(flatten)]
     lens: CameraArgs,
-    /// Write a contact sheet: frames from all over the data between the ones before and after them.
+    /// Write a contact sheet: frames from all over the data between the ones before and after them; where there is depth,
+    /// below them the frame after, warped by it, which should look like the frame [default: none is written].
     #[arg(long, value_name = "PNG")]
     sheet: Option<PathBuf>,
     /// Leave out the test whether the camera fits the frames [default: it is made].

@@ -17,7 +17,8 @@ pub(super) struct Pinhole {
 }
 
 impl Pinhole {
-    fn ray(&self, [x, y]: [f64; 2]) -> Vector {
+    /// The ray through a pixel, of depth 1.
+    pub(super) fn ray(&self, [x, y]: [f64; 2]) -> Vector {
         [(x - self.centre[0]) / self.focal[0], (y - self.centre[1]) / self.focal[1], 1.0]
     }
 }

@@ -18,6 +18,7 @@ mod profile;
 mod tests;
 mod track;
 mod vectors;
+mod warp;
 
 use rayon::prelude::*;
 use serde::Serialize;
@@ -29,6 +30,7 @@ use super::DataSource;
 use crate::camera::Intrinsics;
 
 pub use self::profile::Range;
+pub(super) use self::warp::warped;
 
 /// Pairs of frames whose points are followed, and how many of them are used: those that turn most.
 const CANDIDATES: usize = 72;
