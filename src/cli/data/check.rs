@@ -86,6 +86,10 @@ fn look(args: &Args) -> Result<Report> {
         camera_fit: Vec::new(),
         step: None,
     };
+    if args.split.is_some() {
+        // A list may leave out what is wrong.
+        report.advice.append(&mut report.faults);
+    }
     let sizes = &args.sizes;
     let open = |size| open_folder(&args.dir, args.split.as_deref(), size, args.lens.or(Camera::Auto), true, None);
     let opened = match open([sizes.height, sizes.width]) {
@@ -100,7 +104,8 @@ fn look(args: &Args) -> Result<Report> {
     let found = data::check::check(opened.as_ref(), |done| progress.set(done as u64, ""));
     progress.finish();
     // Frames whose headers cannot be read were named by folder already.
-    let known: usize = report.folders.iter().map(|folder| folder.unreadable.len()).sum();
+    let named = |folder: &Folder| if args.split.is_some() { 0 } else { folder.unreadable.len() };
+    let known: usize = report.folders.iter().map(named).sum();
     if found.unreadable.len() > known || found.train == 0 {
         report.faults.extend(found.faults());
     }
