@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
+use parallax::data::apart::neighbours;
 use parallax::monovit::{Preset, Setup};
 use parallax::train::cost::check_memory;
 use parallax::train::data::{self, STREET};
@@ -38,6 +39,10 @@ pub struct Args {
     /// List of a folder's frames to validate on [default: the last tenth of each drive, with a gap before it].
     #[arg(long, value_name = "FILE")]
     val_split: Option<PathBuf>,
+    /// File of the folder's prepared frames, as `parallax data prepare` writes it [default: the one of this size that lies
+    /// in the folder, if there is any].
+    #[arg(long, value_name = "FILE")]
+    prepared: Option<PathBuf>,
     #[command(flatten)]
     lens: CameraArgs,
     /// Size of the networks [default: nano, or that of the weights to start from].
@@ -146,6 +151,11 @@ pub fn run(args: Args) -> Result<()> {
     );
     for camera in data.train.cameras() {
         note!("camera: {camera}");
+    }
+    for aside in [Some(&data.validation), data.test.as_ref()].into_iter().flatten() {
+        if let Some(warning) = neighbours(data.train.as_ref(), aside.as_ref()) {
+            note!("warning: {warning}");
+        }
     }
     let began = Instant::now();
     let mut progress = Progress::new("training", run.config.steps);
@@ -337,6 +347,7 @@ impl Args {
             ("--learning-rate", self.learning_rate.is_some()),
             ("--seed", self.seed.is_some()),
             ("--val-split", self.val_split.is_some()),
+            ("--prepared", self.prepared.is_some()),
             ("--fov", self.lens.fov.is_some()),
             ("--intrinsics", self.lens.intrinsics.is_some()),
             ("--camera", self.lens.camera.is_some()),
@@ -389,6 +400,7 @@ fn configuration(args: &Args) -> Result<RunConfig> {
     for (to, from) in [
         (&mut c.split, &args.split),
         (&mut c.val_split, &args.val_split),
+        (&mut c.prepared, &args.prepared),
         (&mut c.init_encoder, &args.init_encoder),
         (&mut c.init_pose, &args.init_pose),
     ] {

@@ -2,11 +2,12 @@
 
 use std::collections::HashMap;
 use std::hash::Hash;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use image::RgbImage;
 
+use super::prepared::Prepared;
 use super::resize::lanczos;
 use crate::formats::picture::read_picture;
 use crate::{Error, Result};
@@ -17,6 +18,8 @@ pub(super) struct Pictures<K> {
     height: u32,
     most_bytes: usize,
     kept: Mutex<Kept<K>>,
+    /// Frames that were prepared at this size.
+    prepared: Option<Prepared>,
 }
 
 struct Kept<K> {
@@ -31,7 +34,25 @@ impl<K: Eq + Hash> Pictures<K> {
     /// If a side is 0 or longer than 16384.
     pub(super) fn new(height: usize, width: usize, most_bytes: usize) -> Result<Self> {
         let kept = Mutex::new(Kept { pictures: HashMap::new(), bytes: 0 });
-        Ok(Pictures { width: side("width", width)?, height: side("height", height)?, most_bytes, kept })
+        Ok(Pictures { width: side("width", width)?, height: side("height", height)?, most_bytes, kept, prepared: None })
+    }
+
+    /// Takes frames from the file of prepared ones in the folder of the data, if there is one of this size.
+    ///
+    /// # Errors
+    /// If it is damaged, or older than the frames.
+    pub(super) fn with_prepared(mut self, root: &Path) -> Result<Self> {
+        self.prepared = Prepared::find(root, [self.height as usize, self.width as usize])?;
+        Ok(self)
+    }
+
+    /// Takes frames from a file of prepared ones of the folder `root`.
+    ///
+    /// # Errors
+    /// As [`Prepared::open`].
+    pub(super) fn take_from(&mut self, file: &Path, root: &Path) -> Result<()> {
+        self.prepared = Some(Prepared::open(file, root, [self.height as usize, self.width as usize])?);
+        Ok(())
     }
 
     /// A frame, from the file that `path` gives if it is not kept.
@@ -39,10 +60,11 @@ impl<K: Eq + Hash> Pictures<K> {
         if let Some(picture) = self.kept().pictures.get(&key) {
             return Ok(picture.clone());
         }
-        let picture = read_picture(&path()?)?;
-        let picture = Arc::new(match picture.dimensions() == (self.width, self.height) {
-            true => picture,
-            false => lanczos(&picture, self.width, self.height),
+        let path = path()?;
+        let prepared = self.prepared.as_ref().map(|prepared| prepared.get(&path)).transpose()?.flatten();
+        let picture = Arc::new(match prepared {
+            Some(picture) => picture,
+            None => read_resized(&path, self.width, self.height)?,
         });
         let bytes = picture.as_raw().len();
         let mut kept = self.kept();
@@ -67,7 +89,20 @@ impl<K: Eq + Hash> Pictures<K> {
     }
 }
 
-fn side(name: &str, size: usize) -> Result<u32> {
+/// A picture at `width x height` pixels.
+///
+/// # Errors
+/// If it cannot be read.
+pub(super) fn read_resized(path: &Path, width: u32, height: u32) -> Result<RgbImage> {
+    let picture = read_picture(path)?;
+    Ok(if picture.dimensions() == (width, height) { picture } else { lanczos(&picture, width, height) })
+}
+
+/// The side of a picture.
+///
+/// # Errors
+/// If it is 0 or longer than 16384.
+pub(super) fn side(name: &str, size: usize) -> Result<u32> {
     match u32::try_from(size) {
         Ok(size) if (1..=1 << 14).contains(&size) => Ok(size),
         _ => Err(Error::setting(name, format!("expected 1 to {} pixels, found {size}", 1 << 14))),

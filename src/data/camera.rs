@@ -181,7 +181,8 @@ fn of_fov(degrees: f64, [width, height]: [f64; 2]) -> Result<Intrinsics, String>
     of_pixels([focal, focal, (width - 1.0) / 2.0, (height - 1.0) / 2.0], [width, height])
 }
 
-fn of_pixels([fx, fy, cx, cy]: [f64; 4], [width, height]: [f64; 2]) -> Result<Intrinsics, String> {
+/// Intrinsics of a picture of a size from pixels; why they cannot be, if they cannot.
+pub(super) fn of_pixels([fx, fy, cx, cy]: [f64; 4], [width, height]: [f64; 2]) -> Result<Intrinsics, String> {
     let focal = |f: f64| f > 0.0 && f.is_finite();
     if !(focal(fx) && focal(fy) && width > 0.0 && height > 0.0) {
         return Err(format!("focal lengths {fx}, {fy} of {width}x{height} pixels: expected numbers above 0"));

@@ -110,7 +110,7 @@ impl Frames {
                 folders.entry(folder).or_default().push(picture.path);
             }
         }
-        let pictures = Pictures::new(height, width, options.cache_bytes)?;
+        let pictures = Pictures::new(height, width, options.cache_bytes)?.with_prepared(root)?;
         let mut found = Frames {
             sequences: Vec::new(),
             samples: Vec::new(),
@@ -214,6 +214,10 @@ impl Frames {
         Ok(())
     }
 
+    pub(super) fn pictures_mut(&mut self) -> &mut Pictures<Place> {
+        &mut self.pictures
+    }
+
     /// Frames that lack the depth map that was asked for.
     pub fn left_out(&self) -> &LeftOut {
         &self.left_out
@@ -281,6 +285,10 @@ impl DataSource for Frames {
 
     fn place(&self, sample: usize) -> Place {
         self.samples[sample]
+    }
+
+    fn recording(&self, sample: usize) -> String {
+        self.sequences[self.samples[sample].sequence].name.clone()
     }
 
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {

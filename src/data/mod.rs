@@ -1,15 +1,18 @@
 //! Where frames come from: the embedded street, KITTI raw, any folder; and what is done to them before training.
 
+pub mod apart;
 pub mod aside;
 pub mod augment;
 pub mod batch;
 mod cache;
 pub mod camera;
+pub mod camera_fit;
 pub mod check;
 pub mod frames;
 pub mod inputs;
 
 pub mod kitti;
+pub mod prepared;
 pub mod pyramid;
 pub mod resize;
 pub mod stereo;
@@ -74,6 +77,11 @@ pub trait DataSource: Send + Sync {
         Place { sequence: 0, frame: sample }
     }
 
+    /// The name of the recording that a sample belongs to: the same whichever list the data were opened with.
+    fn recording(&self, sample: usize) -> String {
+        self.place(sample).sequence.to_string()
+    }
+
     /// Ground-truth depth of the target frame at its own size, where there is one.
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>>;
 
@@ -97,20 +105,47 @@ fn no_second_camera(sample: &str) -> Error {
     Error::setting("sources", format!("{sample} has no second camera: train with --sources mono"))
 }
 
-/// Opens a folder to train on: KITTI raw by its layout ([`kitti`]), or any folder of frames ([`frames`]). Of the samples,
-/// all with the `sources` that are asked for, those that a list names, or all; pictures come out at `[height, width]`
-/// pixels.
+/// How a folder is opened.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Opening<'a> {
+    /// A list of the samples to take; without, all.
+    pub list: Option<&'a Path>,
+    /// Height and width at which pictures come out.
+    pub size: [usize; 2],
+    /// The camera that took the pictures.
+    pub camera: camera::Camera,
+    /// Whether samples with a frame that cannot be read are left out; they are an error otherwise.
+    pub skip_bad_frames: bool,
+    /// The frames that a sample needs beside the target.
+    pub sources: Sources,
+    /// A file of [`prepared`] frames; without, that which lies in the folder, if there is one.
+    pub prepared: Option<&'a Path>,
+    /// How many bytes of resized pictures are kept in memory.
+    pub cache_bytes: usize,
+}
+
+impl Opening<'_> {
+    /// All samples with both neighbours, at a height and width, by the camera that the folder says.
+    pub fn of(size: [usize; 2]) -> Self {
+        Opening {
+            list: None,
+            size,
+            camera: camera::Camera::Auto,
+            skip_bad_frames: false,
+            sources: Sources::Mono,
+            prepared: None,
+            cache_bytes: frames::Options::default().cache_bytes,
+        }
+    }
+}
+
+/// Opens a folder to train on: KITTI raw by its layout ([`kitti`]), or any folder of frames ([`frames`]).
 ///
 /// # Errors
-/// As [`Kitti::open`](kitti::Kitti::open) and [`Frames::open`](frames::Frames::open).
-pub fn open_folder(
-    root: &Path,
-    list: Option<&Path>,
-    size: [usize; 2],
-    camera: camera::Camera,
-    skip_bad_frames: bool,
-    sources: Sources,
-) -> Result<Arc<dyn DataSource>> {
+/// As [`Kitti::open`](kitti::Kitti::open) and [`Frames::open`](frames::Frames::open), and if prepared frames do not belong to the
+/// folder's ([`Prepared::open`](prepared::Prepared::open)).
+pub fn open_folder(root: &Path, opening: Opening) -> Result<Arc<dyn DataSource>> {
+    let Opening { list, size, camera, skip_bad_frames, sources, prepared, cache_bytes } = opening;
     if root.is_file() {
         let message = "is a file: make a folder of frames of a film, for example with ffmpeg -i FILM -qscale:v 2 -vf \
                        fps=10 FRAMES/%06d.jpg";
@@ -122,16 +157,25 @@ pub fn open_folder(
     }
     if kitti::is_kitti(root)? {
         let (neighbours, stereo) = (sources.in_time(), sources.other_camera());
-        let options = kitti::Options { camera, skip_bad_frames, neighbours, stereo, ..kitti::Options::default() };
-        return Ok(Arc::new(kitti::Kitti::open(root, list, size[0], size[1], options)?));
+        let usual = kitti::Options::default();
+        let options = kitti::Options { camera, skip_bad_frames, neighbours, stereo, cache_bytes, ..usual };
+        let mut kitti = kitti::Kitti::open(root, list, size[0], size[1], options)?;
+        if let Some(file) = prepared {
+            kitti.pictures_mut().take_from(file, root)?;
+        }
+        return Ok(Arc::new(kitti));
     }
     if sources.other_camera() {
         let message = "a folder of frames has one camera: train with --sources mono, or on KITTI raw, whose image_02 and \
                        image_03 are a pair";
         return Err(Error::setting("sources", message));
     }
-    let options = frames::Options { camera, skip_bad_frames, ..frames::Options::default() };
-    Ok(Arc::new(frames::Frames::open(root, list, size, options)?))
+    let options = frames::Options { camera, skip_bad_frames, cache_bytes, ..frames::Options::default() };
+    let mut frames = frames::Frames::open(root, list, size, options)?;
+    if let Some(file) = prepared {
+        frames.pictures_mut().take_from(file, root)?;
+    }
+    Ok(Arc::new(frames))
 }
 
 /// Some samples of a data set.
@@ -171,6 +215,9 @@ impl DataSource for Subset {
     }
     fn place(&self, sample: usize) -> Place {
         self.data.place(self.samples[sample])
+    }
+    fn recording(&self, sample: usize) -> String {
+        self.data.recording(self.samples[sample])
     }
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {
         self.data.depth(self.samples[sample])

@@ -63,6 +63,18 @@ fn write_whole(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> io::Resu
     writer.get_ref().sync_all()
 }
 
+/// Gives a file that was written piece by piece its name: flushed to the disk, then renamed from `partial` over `path`, in
+/// the same folder.
+///
+/// # Errors
+/// If it cannot be flushed or renamed: `partial` is left as it is, and so is what stood at `path`.
+pub fn appear(file: File, partial: &Path, path: &Path) -> Result<()> {
+    file.sync_all().map_err(|e| Error::io(partial, e))?;
+    // Some systems do not rename an open file.
+    drop(file);
+    fs::rename(partial, path).map_err(|e| Error::io(path, e))
+}
+
 /// [`write_atomically`] for bytes that are at hand.
 pub fn write_bytes_atomically(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
     write_atomically(path, |writer| writer.write_all(bytes))

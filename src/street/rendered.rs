@@ -75,13 +75,46 @@ impl Street {
     /// Renders all sequences, on rayon's threads; the pictures are the same for any number of them. `progress` gets the
     /// number of frames done and of all, from any thread.
     pub fn render(config: &StreetConfig, progress: Option<&(dyn Fn(usize, usize) + Sync)>) -> Street {
+        let sequence = |k: usize, world: &World| {
+            drive(
+                &mut Draw::new(config.seed, k as u64, PATH),
+                config.frames,
+                world.lane,
+                world.room,
+                config.moving_cars,
+            )
+        };
+        Street::film(config, &sequence, progress)
+    }
+
+    /// Renders the streets of `config` along given paths, one a sequence: camera poses, one a frame. Its `sequences` and
+    /// `frames` are those of the paths. All else is as in [`Street::render`]; nothing keeps a path out of walls.
+    ///
+    /// # Panics
+    /// If the paths differ in length.
+    pub fn render_along(
+        config: &StreetConfig,
+        paths: &[Vec<Pose>],
+        progress: Option<&(dyn Fn(usize, usize) + Sync)>,
+    ) -> Street {
+        let frames = paths.first().map_or(0, Vec::len);
+        assert!(paths.iter().all(|path| path.len() == frames), "render_along: paths of one length expected");
+        let config = StreetConfig { sequences: paths.len(), frames, ..config.clone() };
+        Street::film(&config, &|k, _| paths[k].clone(), progress)
+    }
+
+    /// Renders every sequence along the path that `path` gives for its number and its world.
+    fn film(
+        config: &StreetConfig,
+        path: &(dyn Fn(usize, &World) -> Vec<Pose> + Sync),
+        progress: Option<&(dyn Fn(usize, usize) + Sync)>,
+    ) -> Street {
         let cameras = if config.baseline == 0.0 { 1 } else { 2 };
         let total = config.sequences * config.frames * cameras;
         let done = AtomicUsize::new(0);
         let sequence = |k: usize| {
             let world = street(&mut Draw::new(config.seed, k as u64, WORLD), config.frames, config.moving_cars);
-            let draw = &mut Draw::new(config.seed, k as u64, PATH);
-            let poses = drive(draw, config.frames, world.lane, world.room, config.moving_cars);
+            let poses = path(k, &world);
             let image = |frame: usize, pose: Pose| {
                 let image = Scene::new(&world, View::new(config, pose), frame).image();
                 let done = done.fetch_add(1, Ordering::Relaxed) + 1;

@@ -1,13 +1,13 @@
 //! The data of a run: what its configuration calls `street` or a folder, split in three.
 
-use std::collections::HashSet;
 use std::path::Path;
 use std::sync::Arc;
 
 use super::recipe::RunConfig;
 use super::run::RunData;
+use crate::data::apart::refuse_shared;
 use crate::data::aside::set_aside;
-use crate::data::{DataSource, Subset, open_folder};
+use crate::data::{DataSource, Opening, Subset, open_folder};
 use crate::error::{Error, Result};
 use crate::street::{Street, StreetConfig};
 
@@ -65,7 +65,10 @@ fn street(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + S
 /// The samples of the run's folder that a list names, or all.
 fn samples(config: &RunConfig, list: Option<&Path>) -> Result<Arc<dyn DataSource>> {
     let size = [config.height, config.width];
-    open_folder(Path::new(&config.data), list, size, config.camera, config.skip_bad_frames, config.sources)
+    let RunConfig { camera, skip_bad_frames, sources, ref prepared, .. } = *config;
+    let usual = Opening::of(size);
+    let opening = Opening { list, camera, skip_bad_frames, sources, prepared: prepared.as_deref(), ..usual };
+    open_folder(Path::new(&config.data), opening)
 }
 
 fn folder(config: &RunConfig) -> Result<RunData> {
@@ -73,7 +76,7 @@ fn folder(config: &RunConfig) -> Result<RunData> {
     let (train, aside): (Arc<dyn DataSource>, Arc<dyn DataSource>) = match &config.val_split {
         Some(split) => {
             let aside = samples(config, Some(split))?;
-            apart(all.as_ref(), aside.as_ref(), split)?;
+            refuse_shared(all.as_ref(), aside.as_ref(), split)?;
             (all, aside)
         }
         None => {
@@ -91,13 +94,4 @@ fn folder(config: &RunConfig) -> Result<RunData> {
         validation: Arc::new(Subset::new(aside.clone(), validation)),
         test: (!test.is_empty()).then(|| Arc::new(Subset::new(aside, test)) as Arc<dyn DataSource>),
     })
-}
-
-/// Makes sure that no frame is trained on and validated on.
-fn apart(train: &dyn DataSource, aside: &dyn DataSource, split: &Path) -> Result<()> {
-    let trained: HashSet<String> = (0..train.len()).map(|i| train.name(i)).collect();
-    match (0..aside.len()).map(|i| aside.name(i)).find(|name| trained.contains(name)) {
-        Some(name) => Err(Error::file(split, format!("{name} is trained on, too: take it out of one of the lists"))),
-        None => Ok(()),
-    }
 }

@@ -162,6 +162,10 @@ pub struct RunConfig {
     /// Whether samples with a frame that cannot be read are passed over and counted; they end the run otherwise.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub skip_bad_frames: bool,
+    /// The file of a folder's prepared frames ([`data::prepared`](crate::data::prepared)); without it, the one that lies in
+    /// the folder, if there is any.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub prepared: Option<PathBuf>,
     /// Weights to start from: files or folders, all four networks together.
     #[serde(default, deserialize_with = "none_one_or_many", skip_serializing_if = "Vec::is_empty")]
     pub init: Vec<PathBuf>,
@@ -242,6 +246,7 @@ impl RunConfig {
             sources: Sources::Mono,
             baseline: Baseline::Calibrated,
             skip_bad_frames: false,
+            prepared: None,
             init: Vec::new(),
             init_encoder: None,
             init_pose: None,

@@ -3,6 +3,7 @@
 mod agree;
 mod breakdown;
 mod job;
+mod load;
 mod roofline;
 
 use std::path::PathBuf;
@@ -36,6 +37,8 @@ enum What {
     /// Compare each op of a training step with the machine's limits of arithmetic and memory.
     #[command(alias = "ops")]
     Roofline(Counted),
+    /// Time training steps on a folder's files, and the same with their batches in memory, by turns.
+    Load(load::Args),
     /// One convolution, forward: 3x3, batch 2, 3 channels of 320x320 to 16.
     #[command(hide = true)]
     Conv {
@@ -104,6 +107,7 @@ pub fn run(args: Args) -> Result<()> {
         What::Step(timed) => time_network(&timed, None),
         What::Infer { timed, precision } => time_network(&timed, Some(precision.checked()?)),
         What::Roofline(counted) => roofline::run(&counted),
+        What::Load(args) => load::run(&args),
         What::Conv { iterations, json } => {
             report(&timing(job::measure(&mut Conv::new(), iterations, false)?, false)?, json)
         }

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use super::Side;
 use crate::camera::Intrinsics;
+use crate::data::camera::of_pixels;
 use crate::formats::bounded::{MAX_SETTINGS, read_text};
 use crate::formats::picture::is_size;
 use crate::{Error, Result};
@@ -59,7 +60,9 @@ impl Calibration {
             Side::Left => "02",
             Side::Right => "03",
         };
-        Ok(Projection::read(&entries, camera)?.intrinsics())
+        let Projection { size, matrix: p } = Projection::read(&entries, camera)?;
+        of_pixels([p[0], p[5], p[2], p[6]], size)
+            .map_err(|why| Error::file(&entries.path, format!("P_rect_{camera}: {why}; restore the file")))
     }
 
     /// Reads the files in the folder of a day; that of the LiDAR only `with_lidar`.
@@ -232,6 +235,15 @@ mod tests {
             let day = day(&lines, "");
             let error = Calibration::read(day.path(), false).unwrap_err().to_string();
             assert!(error.contains(CAMERAS) && error.contains(what), "{error}");
+        }
+        for (line, what) in [
+            ("P_rect_02: 700 0 1300 45 0 710 170 0.2 0 0 1 0", "outside the picture"),
+            ("P_rect_02: -7 0 600 45 0 710 170 0.2 0 0 1 0", "above 0"),
+        ] {
+            let mut lines = CAMERA_LINES;
+            lines[3] = line;
+            let error = Calibration::intrinsics_of(day(&lines, "").path(), Side::Left).unwrap_err().to_string();
+            assert!(error.contains(CAMERAS) && error.contains("P_rect_02") && error.contains(what), "{error}");
         }
         let huge = day(&CAMERA_LINES, "");
         File::options().write(true).open(huge.path().join(CAMERAS)).unwrap().set_len(1 << 40).unwrap();

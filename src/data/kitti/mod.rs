@@ -206,7 +206,7 @@ impl Kitti {
             baselines: BTreeMap::new(),
             left_out: LeftOut::default(),
             unreadable: Vec::new(),
-            pictures: Pictures::new(height, width, options.cache_bytes)?,
+            pictures: Pictures::new(height, width, options.cache_bytes)?.with_prepared(root)?,
         };
         match split {
             Some(split) => kitti.take_split(root, split)?,
@@ -459,6 +459,10 @@ impl Kitti {
         }
     }
 
+    pub(super) fn pictures_mut(&mut self) -> &mut Pictures<impl Eq + std::hash::Hash + use<>> {
+        &mut self.pictures
+    }
+
     /// As the line of a split list: `FOLDER FRAME SIDE`.
     fn name_of(&self, frame: Frame) -> String {
         format!("{} {} {}", self.drives[frame.drive].folder, frame.number, frame.side.letter())
@@ -577,6 +581,10 @@ impl DataSource for Kitti {
     fn other_image(&self, sample: usize) -> Result<Arc<RgbImage>> {
         let target = self.samples[sample];
         self.picture(Frame { side: target.side.other(), ..target }, target)
+    }
+
+    fn recording(&self, sample: usize) -> String {
+        self.drives[self.samples[sample].drive].folder.clone()
     }
 
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {

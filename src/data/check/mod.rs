@@ -1,13 +1,23 @@
 //! Inspection of a data set before training: still stretches, exposure jumps, cuts, unreadable frames.
 
+mod sheet;
+mod survey;
+mod times;
+
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use image::RgbImage;
+use rayon::prelude::*;
 use serde::Serialize;
 
 use super::DataSource;
 use super::aside::set_aside;
-use crate::Result;
+use crate::{Error, Result};
+
+pub use sheet::contact_sheet;
+pub(super) use survey::frame_files;
+pub use survey::{Folder, OfSize, survey};
 
 /// Neighbours that differ by less than so many of 255 levels on average: the camera stood still, and nothing can be learnt.
 const STILL: f64 = 0.7;
@@ -51,15 +61,24 @@ pub struct Findings {
 }
 
 impl Findings {
-    /// Advice in words, one sentence for each fault; empty if there is none.
-    pub fn advice(&self) -> Vec<String> {
-        let mut advice = Vec::new();
+    /// What makes it impossible to train on the data as they are, one sentence for each fault; empty if there is none.
+    pub fn faults(&self) -> Vec<String> {
+        let mut faults = Vec::new();
         if let Some((name, why)) = self.unreadable.first() {
             let n = self.unreadable.len();
-            advice.push(format!(
-                "{n} frames cannot be read (the first: {name}: {why}): restore them, or --skip-bad-frames"
+            faults.push(format!(
+                "{n} frames cannot be read (the first: {name}: {why}): restore them, or train with --skip-bad-frames"
             ));
         }
+        if self.train == 0 {
+            faults.push("there is no frame with both neighbours to train on".to_owned());
+        }
+        faults
+    }
+
+    /// What should be looked at, one sentence for each; empty if there is nothing.
+    pub fn advice(&self) -> Vec<String> {
+        let mut advice = Vec::new();
         for recording in &self.recordings {
             let Recording { first, samples, still, jumps, cuts, .. } = recording;
             if *still as f64 > MANY * *samples as f64 {
@@ -88,37 +107,67 @@ impl Findings {
     }
 }
 
-/// Looks at every sample and its next frame, at the size the networks see. `progress` hears how many are done.
-///
-/// # Errors
-/// If a frame cannot be read whose header could.
-pub fn check(data: &dyn DataSource, mut progress: impl FnMut(usize)) -> Result<Findings> {
+/// Samples whose frames are decoded at a time.
+const AT_A_TIME: usize = 32;
+
+/// Looks at every sample and its next frame, at the size the networks see. `progress` hears how many are done. Frames that
+/// turn out to be unreadable are among the findings.
+pub fn check(data: &dyn DataSource, mut progress: impl FnMut(usize)) -> Findings {
     let mut recordings: BTreeMap<usize, Recording> = BTreeMap::new();
-    for sample in 0..data.len() {
-        let recording = recordings.entry(data.place(sample).sequence).or_default();
-        if recording.samples == 0 {
-            recording.first = data.name(sample);
+    let mut unreadable = data.unreadable().to_vec();
+    let note = |unreadable: &mut Vec<(String, String)>, sample: usize, error: &Error| {
+        let why = error.to_string();
+        // A frame is the neighbour of others: it is named once.
+        if !unreadable.iter().any(|(_, known)| *known == why) {
+            unreadable.push((data.name(sample), why));
         }
-        recording.samples += 1;
-        recording.with_depth += usize::from(data.depth(sample)?.is_some());
-        let (frame, next) = (data.image(sample, 0)?, data.image(sample, 1)?);
-        let (apart, brighter) = difference(&frame, &next);
-        if apart > CUT {
-            recording.cuts.push(data.name(sample));
-        } else if brighter.abs() > JUMP {
-            recording.jumps.push(data.name(sample));
+    };
+    for first in (0..data.len()).step_by(AT_A_TIME) {
+        let samples = first..(first + AT_A_TIME).min(data.len());
+        type Seen = (Result<[Arc<RgbImage>; 2]>, Result<bool>);
+        let look = |sample: usize| -> Seen {
+            let frames = data.image(sample, 0).and_then(|frame| Ok([frame, data.image(sample, 1)?]));
+            (frames, data.depth(sample).map(|depth| depth.is_some()))
+        };
+        let seen: Vec<Seen> = samples.clone().into_par_iter().map(look).collect();
+        for (sample, (frames, depth)) in samples.zip(seen) {
+            let recording = recordings.entry(data.place(sample).sequence).or_default();
+            if recording.samples == 0 {
+                recording.first = data.name(sample);
+            }
+            recording.samples += 1;
+            match depth {
+                Ok(there) => recording.with_depth += usize::from(there),
+                Err(error) => note(&mut unreadable, sample, &error),
+            }
+            match frames {
+                Ok([frame, next]) => recording.compare(&data.name(sample), &frame, &next),
+                Err(error) => note(&mut unreadable, sample, &error),
+            }
+            progress(sample + 1);
         }
-        recording.still += usize::from(apart < STILL);
-        progress(sample + 1);
     }
     let (train, aside) = set_aside(data);
-    Ok(Findings {
+    Findings {
         recordings: recordings.into_values().collect(),
-        unreadable: data.unreadable().to_vec(),
+        unreadable,
         cameras: data.cameras(),
         train: train.len(),
         aside: aside.len(),
-    })
+    }
+}
+
+impl Recording {
+    /// Notes what lies between a sample and its next frame.
+    fn compare(&mut self, name: &str, frame: &RgbImage, next: &RgbImage) {
+        let (apart, brighter) = difference(frame, next);
+        if apart > CUT {
+            self.cuts.push(name.to_owned());
+        } else if brighter.abs() > JUMP {
+            self.jumps.push(name.to_owned());
+        }
+        self.still += usize::from(apart < STILL);
+    }
 }
 
 /// The mean absolute difference of two pictures in levels, and how much brighter the second is.
@@ -128,31 +177,6 @@ fn difference(a: &RgbImage, b: &RgbImage) -> (f64, f64) {
     let apart: f64 = pairs().map(|(&x, &y)| f64::from(x.abs_diff(y))).sum();
     let brighter: f64 = pairs().map(|(&x, &y)| f64::from(y) - f64::from(x)).sum();
     (apart / n, brighter / n)
-}
-
-/// Columns of a contact sheet.
-const COLUMNS: usize = 8;
-
-/// A contact sheet: samples from all over the data, each with the frames before and after it, one above the other.
-///
-/// # Errors
-/// If a frame cannot be read.
-pub fn contact_sheet(data: &dyn DataSource) -> Result<RgbImage> {
-    let columns = data.len().min(COLUMNS);
-    let mut sheet = RgbImage::new(1, 1);
-    for column in 0..columns {
-        let sample = column * (data.len() - 1) / (columns - 1).max(1);
-        for (row, offset) in [-1, 0, 1].into_iter().enumerate() {
-            let picture = data.image(sample, offset)?;
-            let (width, height) = picture.dimensions();
-            if column == 0 && row == 0 {
-                sheet = RgbImage::new(width * columns as u32, height * 3);
-            }
-            let place = [column as i64 * i64::from(width), row as i64 * i64::from(height)];
-            image::imageops::replace(&mut sheet, picture.as_ref(), place[0], place[1]);
-        }
-    }
-    Ok(sheet)
 }
 
 #[cfg(test)]
@@ -191,7 +215,7 @@ mod tests {
     }
 
     fn found(frames: &[(u8, u8)]) -> Findings {
-        check(&Grey(frames.to_vec()), |_| ()).unwrap()
+        check(&Grey(frames.to_vec()), |_| ())
     }
 
     #[test]
@@ -214,6 +238,40 @@ mod tests {
         let advice = found(&frames).advice();
         assert!(advice.iter().any(|a| a.contains("exposure jumps after frame 4")), "{advice:?}");
         assert!(advice.iter().any(|a| a.contains("another scene begins after frame 9")), "{advice:?}");
+    }
+
+    /// A data set in which a frame cannot be decoded.
+    struct Broken(Grey, usize);
+
+    impl DataSource for Broken {
+        fn len(&self) -> usize {
+            self.0.len()
+        }
+        fn name(&self, sample: usize) -> String {
+            self.0.name(sample)
+        }
+        fn image(&self, sample: usize, offset: i32) -> Result<Arc<RgbImage>> {
+            match sample.checked_add_signed(offset as isize) {
+                Some(frame) if frame == self.1 => Err(Error::file(format!("{frame}.png"), "ends early")),
+                _ => self.0.image(sample, offset),
+            }
+        }
+        fn intrinsics(&self, _: usize) -> Intrinsics {
+            Intrinsics::KITTI
+        }
+        fn depth(&self, _: usize) -> Result<Option<DepthMap>> {
+            Ok(None)
+        }
+    }
+
+    #[test]
+    fn a_frame_that_cannot_be_decoded_is_a_fault_and_named_once() {
+        let moving: Vec<(u8, u8)> = (0..50).map(|i| (100, i)).collect();
+        let found = check(&Broken(Grey(moving), 37), |_| ());
+        assert_eq!(found.unreadable.len(), 1, "{:?}", found.unreadable);
+        let faults = found.faults();
+        assert!(faults.len() == 1 && faults[0].contains("1 frames") && faults[0].contains("37.png"), "{faults:?}");
+        assert_eq!(found.recordings[0].samples, 48);
     }
 
     #[test]

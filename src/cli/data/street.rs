@@ -1,0 +1,88 @@
+//! `parallax data street`.
+
+use std::path::PathBuf;
+
+use parallax::street::{Street, StreetConfig, export};
+use parallax::{Error, Result};
+
+use crate::cli::progress::Progress;
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// Folder to write to, new or empty.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Number of sequences.
+    #[arg(long, default_value_t = 4)]
+    sequences: usize,
+    /// Frames in each sequence.
+    #[arg(long, default_value_t = 24)]
+    frames: usize,
+    /// Height of the pictures.
+    #[arg(long, default_value_t = 96)]
+    height: usize,
+    /// Width of the pictures.
+    #[arg(long, default_value_t = 320)]
+    width: usize,
+    /// Seed of everything random.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// A second camera so far to the right, image_03: 0.54 is KITTI's distance [default: one camera].
+    #[arg(long, value_name = "METRES")]
+    baseline: Option<f64>,
+    /// Add moving cars.
+    #[arg(long)]
+    moving_cars: bool,
+}
+
+/// Pictures that a street may consist of.
+const MOST_GIGABYTES: f64 = 32.0;
+
+pub fn run(a: Args) -> Result<()> {
+    for (name, value) in
+        [("--sequences", a.sequences), ("--frames", a.frames), ("--height", a.height), ("--width", a.width)]
+    {
+        // A sample is a frame with both neighbours.
+        let least = if name == "--frames" { 3 } else { 1 };
+        if !(least..=20_000).contains(&value) {
+            return Err(Error::setting(name, format!("{value} is not from {least} to 20000")));
+        }
+    }
+    let baseline = a.baseline.unwrap_or(0.0);
+    if a.baseline.is_some_and(|b| !(b > 0.0 && b <= 10.0)) {
+        return Err(Error::setting("--baseline", format!("{baseline} is not a distance above 0, up to 10 metres")));
+    }
+    let cameras = if baseline > 0.0 { 2 } else { 1 };
+    // All pictures are held until they are written.
+    let gigabytes =
+        3e-9 * cameras as f64 * [a.sequences, a.frames, a.height, a.width].iter().map(|&n| n as f64).product::<f64>();
+    if gigabytes > MOST_GIGABYTES {
+        let message = format!(
+            "these pictures take {gigabytes:.0} GB of memory (at most {MOST_GIGABYTES}): fewer, or smaller ones"
+        );
+        return Err(Error::setting("--sequences", message));
+    }
+    let config = StreetConfig {
+        height: a.height,
+        width: a.width,
+        sequences: a.sequences,
+        frames: a.frames,
+        seed: a.seed,
+        moving_cars: a.moving_cars,
+        baseline,
+        ..StreetConfig::default()
+    };
+    let progress = std::sync::Mutex::new(Progress::new("frames", (cameras * a.sequences * a.frames) as u64));
+    let report = |done: usize, _: usize| {
+        if let Ok(mut progress) = progress.lock() {
+            progress.set(done as u64, "");
+        }
+    };
+    let street = Street::render(&config, Some(&report));
+    export::write(&street, &a.out)?;
+    if let Ok(progress) = progress.lock() {
+        progress.finish();
+    }
+    note!("wrote {} sequences of {} frames to {}", a.sequences, a.frames, a.out.display());
+    Ok(())
+}
