@@ -7,6 +7,7 @@ use parallax::data::DataSource;
 use parallax::data::camera::Camera;
 use parallax::data::frames::{self, Frames};
 use parallax::data::kitti::{DepthAxis, GroundTruth, Kitti, LeftOut, Options, is_kitti};
+use parallax::data::stills::{Layout, Stills};
 use parallax::eval::metrics::{Protocol, Report, STEREO_SCALE, Scale};
 use parallax::eval::predictions::Predictions;
 use parallax::eval::predictor::{Evaluation, Predictor, evaluate, evaluate_predictions};
@@ -27,7 +28,8 @@ pub struct Args {
     #[arg(long, value_name = "FILE", conflicts_with_all = ["weights", "allow_partial", "height", "width", "flip"])]
     disparities: Option<PathBuf>,
     /// Frames to measure on: `street` (with a seed that no run trains on) or a folder: in
-    /// the layout of KITTI raw, or (protocol dense) of frames with depth maps, as train takes them.
+    /// the layout of KITTI raw, or (protocol dense) of frames with depth maps, as train takes them, or
+    /// in the layout of KITTI 2015, Make3D, DrivingStereo's weather sets or Middlebury 2014.
     #[arg(long, value_name = "street|DIR", default_value = "street")]
     data: String,
     /// List of a folder's frames, lines `FOLDER FRAME SIDE` [default: all].
@@ -210,6 +212,11 @@ impl Args {
         let root = Path::new(&self.data);
         if self.protocol == Protocol::Dense && root.is_dir() && !is_kitti(root)? {
             let camera = Camera::Fov { degrees: 90.0 };
+            if let Some(layout) = Layout::of(root)? {
+                let stills = Stills::open(layout, root, self.split.as_deref(), [height, width], camera)?;
+                let left_out = stills.left_out().clone();
+                return Ok((Box::new(stills), left_out));
+            }
             let options = frames::Options { neighbours: false, with_depth: true, camera, ..frames::Options::default() };
             let frames = Frames::open(root, self.split.as_deref(), [height, width], options)?;
             // Every frame of a list has depth, or opening failed.

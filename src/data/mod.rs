@@ -1,4 +1,4 @@
-//! Where frames come from: the embedded street, KITTI raw, any folder; and what is done to them before training.
+//! Where frames come from: the embedded street, KITTI raw, any folder, single pictures with ground truth; and what is done to them before training.
 
 pub mod aside;
 pub mod augment;
@@ -12,6 +12,7 @@ pub mod inputs;
 pub mod kitti;
 pub mod pyramid;
 pub mod resize;
+pub mod stills;
 mod street;
 
 use std::path::Path;
@@ -80,7 +81,8 @@ pub trait DataSource: Send + Sync {
 /// all with both neighbours, those that a list names, or all; pictures come out at `[height, width]` pixels.
 ///
 /// # Errors
-/// As [`Kitti::open`](kitti::Kitti::open) and [`Frames::open`](frames::Frames::open).
+/// As [`Kitti::open`](kitti::Kitti::open) and [`Frames::open`](frames::Frames::open), and for a layout of single pictures
+/// ([`stills`]).
 pub fn open_folder(
     root: &Path,
     list: Option<&Path>,
@@ -100,6 +102,14 @@ pub fn open_folder(
     if kitti::is_kitti(root)? {
         let options = kitti::Options { camera, skip_bad_frames, ..kitti::Options::default() };
         return Ok(Arc::new(kitti::Kitti::open(root, list, size[0], size[1], options)?));
+    }
+    if let Some(layout) = stills::Layout::of(root)? {
+        let message = format!(
+            "has the layout of {}: single pictures with ground truth, on which eval measures; training needs frames that \
+             follow one another",
+            layout.name()
+        );
+        return Err(Error::file(root, message));
     }
     let options = frames::Options { camera, skip_bad_frames, ..frames::Options::default() };
     Ok(Arc::new(frames::Frames::open(root, list, size, options)?))
