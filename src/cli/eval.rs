@@ -67,7 +67,8 @@ pub struct Args {
     #[arg(long, value_name = "FILE", requires = "poses")]
     trajectory: Option<PathBuf>,
     /// Frames to measure on: `street` (with a seed that no run trains on) or a folder: in
-    /// the layout of KITTI raw, or (where the protocol is not KITTI's) of frames with depth maps, as train takes them.
+    /// the layout of KITTI raw, or (where the protocol is not KITTI's) of frames with depth maps, as train takes them, or
+    /// in the layout of KITTI 2015, Make3D, DrivingStereo's weather sets or Middlebury 2014.
     #[arg(long, value_name = "street|DIR", default_value = "street")]
     data: String,
     /// List of a folder's frames, lines `FOLDER FRAME SIDE` [default: all].

@@ -1,4 +1,4 @@
-//! Where frames come from: the embedded street, KITTI raw, any folder; and what is done to them before training.
+//! Where frames come from: the embedded street, KITTI raw, any folder, single pictures with ground truth; and what is done to them before training.
 
 pub mod apart;
 pub mod aside;
@@ -16,6 +16,7 @@ pub mod prepared;
 pub mod pyramid;
 pub mod resize;
 pub mod stereo;
+pub mod stills;
 mod street;
 
 use std::path::Path;
@@ -142,7 +143,7 @@ impl Opening<'_> {
 /// Opens a folder to train on: KITTI raw by its layout ([`kitti`]), or any folder of frames ([`frames`]).
 ///
 /// # Errors
-/// As [`Kitti::open`](kitti::Kitti::open) and [`Frames::open`](frames::Frames::open), and if prepared frames do not belong to the
+/// If the folder holds single pictures ([`stills`]), as [`Kitti::open`](kitti::Kitti::open) and [`Frames::open`](frames::Frames::open), and if prepared frames do not belong to the
 /// folder's ([`Prepared::open`](prepared::Prepared::open)).
 pub fn open_folder(root: &Path, opening: Opening) -> Result<Arc<dyn DataSource>> {
     let Opening { list, size, camera, skip_bad_frames, sources, prepared, cache_bytes } = opening;
@@ -164,6 +165,14 @@ pub fn open_folder(root: &Path, opening: Opening) -> Result<Arc<dyn DataSource>>
             kitti.pictures_mut().take_from(file, root)?;
         }
         return Ok(Arc::new(kitti));
+    }
+    if let Some(layout) = stills::Layout::of(root)? {
+        let message = format!(
+            "has the layout of {}: single pictures with ground truth, on which eval measures; training needs frames that \
+             follow one another",
+            layout.name()
+        );
+        return Err(Error::file(root, message));
     }
     if sources.other_camera() {
         let message = "a folder of frames has one camera: train with --sources mono, or on KITTI raw, whose image_02 and \

@@ -10,6 +10,8 @@
 //! | [`picture`] | reading pictures: PNG, JPEG, WebP |
 //! | [`png`] | writing them |
 //! | [`depth_png`] | depth as KITTI stores it |
+//! | [`pfm`] | reading disparity as Middlebury stores it |
+//! | [`mat`] | reading an array of a MATLAB 5 file |
 //! | [`ply`] | coloured point clouds |
 //!
 //! [`TensorFile`] opens any file of named tensors.
@@ -18,8 +20,10 @@ pub mod atomic;
 pub mod bounded;
 pub mod depth_png;
 mod jpeg_scans;
+pub mod mat;
 pub mod npy;
 pub mod npz;
+pub mod pfm;
 pub mod picture;
 mod picture_structure;
 pub mod ply;

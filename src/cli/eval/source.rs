@@ -7,6 +7,7 @@ use parallax::data::DataSource;
 use parallax::data::camera::Camera;
 use parallax::data::frames::{self, Frames};
 use parallax::data::kitti::{DepthAxis, GroundTruth, Kitti, LeftOut, Options, is_kitti};
+use parallax::data::stills::{Layout, Stills};
 use parallax::eval::projected::Projected;
 use parallax::eval::protocol::Protocol;
 use parallax::eval::scale::Scale;
@@ -32,6 +33,11 @@ pub fn open(args: &Args, height: usize, width: usize) -> Result<(Box<dyn DataSou
     let camera = |otherwise| if matches!(args.scale, Scale::CameraHeight(_)) { Camera::Auto } else { otherwise };
     if kittis.is_none() && root.is_dir() && !is_kitti(root)? {
         let camera = camera(Camera::Fov { degrees: 90.0 });
+        if let Some(layout) = Layout::of(root)? {
+            let stills = Stills::open(layout, root, args.split.as_deref(), [height, width], camera)?;
+            let left_out = stills.left_out().clone();
+            return Ok((Box::new(stills), left_out));
+        }
         let options = frames::Options { neighbours: false, with_depth: true, camera, ..frames::Options::default() };
         let frames = Frames::open(root, args.split.as_deref(), [height, width], options)?;
         // Every frame of a list has depth, or opening failed.

@@ -127,6 +127,42 @@ impl Calibration {
     }
 }
 
+/// What a calibration file says of two rectified cameras side by side.
+#[derive(Clone, Debug, PartialEq)]
+pub(in crate::data) struct StereoPair {
+    left: Projection,
+    right: Projection,
+}
+
+impl StereoPair {
+    /// Reads `S_rect_C` and `P_rect_C` of the left and the right camera.
+    ///
+    /// # Errors
+    /// If one is missing, stands there twice or cannot be, or the right camera is not to the right of the left one.
+    pub(in crate::data) fn read(path: &Path, [left, right]: [&str; 2]) -> Result<StereoPair> {
+        let entries = Entries::read(path.to_owned())?;
+        let pair = StereoPair { left: Projection::read(&entries, left)?, right: Projection::read(&entries, right)? };
+        if pair.left.matrix[0] > 0.0 && pair.baseline() > 0.0 {
+            return Ok(pair);
+        }
+        let message = format!(
+            "P_rect_{left}, P_rect_{right}: expected a focal length above 0, and a first row whose last number is smaller \
+             in the right camera's"
+        );
+        Err(Error::file(path, message))
+    }
+
+    /// The intrinsics of the left camera.
+    pub(in crate::data) fn intrinsics(&self) -> Intrinsics {
+        self.left.intrinsics()
+    }
+
+    /// Metres between the cameras: `(P_left[0, 3] - P_right[0, 3]) / f`.
+    pub(in crate::data) fn baseline(&self) -> f64 {
+        (self.left.matrix[3] - self.right.matrix[3]) / self.left.matrix[0]
+    }
+}
+
 /// `[R | t]` with the last row 0 0 0 1.
 fn rigid(r: [f64; 9], t: [f64; 3]) -> [f64; 16] {
     let [a, b, c, d, e, f, g, h, i] = r;
@@ -147,8 +183,15 @@ struct Entries {
 impl Entries {
     fn read(path: PathBuf) -> Result<Entries> {
         let text = read_text(&path, MAX_SETTINGS, "a calibration")?;
-        let entry = |line: &str| line.split_once(':').map(|(k, v)| (k.trim().to_owned(), v.trim().to_owned()));
-        Ok(Entries { values: text.lines().filter_map(entry).collect(), path })
+        let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
+        let mut values = HashMap::new();
+        for (key, value) in text.lines().filter_map(|line| line.split_once(':')) {
+            let key = key.trim();
+            if values.insert(key.to_owned(), value.trim().to_owned()).is_some() {
+                return Err(Error::file(path, format!("{key}: stands there twice; leave the right line of it")));
+            }
+        }
+        Ok(Entries { path, values })
     }
 
     /// The `N` finite numbers of a key.

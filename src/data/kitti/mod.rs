@@ -22,6 +22,7 @@ use image::RgbImage;
 
 use crate::formats::depth_png::read_depth_png;
 pub use calibration::Calibration;
+pub(super) use calibration::StereoPair;
 pub use lidar::{DepthAxis, project_scan, read_scan};
 pub use split::{Side, SplitLine, read_split};
 
