@@ -1,4 +1,4 @@
-//! Writes a street as files in the layout of KITTI raw, so that any reader of KITTI can take it.
+//! Writes a street as files: in the layout of KITTI raw, so that any reader of KITTI can take it, or as folders of frames.
 //!
 //! ```text
 //! OUT/2011_09_26/calib_cam_to_cam.txt
@@ -7,11 +7,21 @@
 //! OUT/2011_09_26/2011_09_26_drive_0000_sync/poses.txt
 //! OUT/splits/train_files.txt
 //! ```
+//!
+//! ```text
+//! OUT/camera.toml
+//! OUT/0000/000000.jpg
+//! OUT/0000/depth/000000.png
+//! ```
 
-use std::fs;
 use std::path::Path;
+use std::{fs, io};
+
+use image::codecs::jpeg::JpegEncoder;
 
 use super::{Pose, Street, StreetConfig};
+use crate::depth::DepthMap;
+use crate::formats::atomic::write_atomically;
 use crate::formats::depth_png::write_depth_png;
 use crate::formats::png::write_png;
 use crate::{Error, Result};
@@ -25,12 +35,7 @@ const DEEPEST: f32 = 250.0;
 /// (`poses.txt`: the twelve numbers of `[R | C]`, a line a frame), the calibration and a split file with every frame
 /// that has both neighbours. Refuses a folder that exists and is not empty.
 pub fn write(street: &Street, out: &Path) -> Result<()> {
-    if let Ok(mut entries) = fs::read_dir(out)
-        && entries.next().is_some()
-    {
-        let message = "the folder is not empty; give a new one, or empty it first: nothing was written";
-        return Err(Error::file(out, message));
-    }
+    refuse_what_is_there(out)?;
     let config = street.config();
     let day = out.join(DAY);
     folder(&day)?;
@@ -52,9 +57,7 @@ pub fn write(street: &Street, out: &Path) -> Result<()> {
             if let Some(image) = street.right_frame(sequence, frame) {
                 write_png(right.join(&file), image)?;
             }
-            let mut depth = street.frame_depth(sequence, frame);
-            depth.metres.iter_mut().for_each(|z| *z = z.min(DEEPEST));
-            write_depth_png(depths.join(&file), &depth)?;
+            write_depth_png(depths.join(&file), &clipped_depth(street, sequence, frame))?;
             if frame > 0 && frame + 1 < config.frames {
                 split += &format!("{DAY}/{name} {frame} l\n");
             }
@@ -64,6 +67,55 @@ pub fn write(street: &Street, out: &Path) -> Result<()> {
     }
     folder(&out.join("splits"))?;
     text(&out.join("splits/train_files.txt"), &split)
+}
+
+/// Writes a folder of JPEG frames for each sequence, exact depth beside them (as in [`write()`]), and the camera in
+/// `camera.toml`. Refuses a folder that exists and is not empty.
+///
+/// # Errors
+/// If the folder is not empty, or a file cannot be written.
+pub fn write_frames(street: &Street, out: &Path) -> Result<()> {
+    refuse_what_is_there(out)?;
+    let config = street.config();
+    folder(out)?;
+    let (w, h, k) = (config.width as f64, config.height as f64, config.intrinsics);
+    let (fx, fy, cx, cy) = (k.fx * w, k.fy * h, k.cx * w, k.cy * h);
+    let camera = format!("width = {w}\nheight = {h}\nfx = {fx:?}\nfy = {fy:?}\ncx = {cx:?}\ncy = {cy:?}\n");
+    text(&out.join("camera.toml"), &camera)?;
+    for sequence in 0..config.sequences {
+        let frames = out.join(format!("{sequence:04}"));
+        folder(&frames.join("depth"))?;
+        for frame in 0..config.frames {
+            let picture = street.frame(sequence, frame);
+            write_atomically(&frames.join(format!("{frame:06}.jpg")), |file| {
+                JpegEncoder::new_with_quality(file, JPEG_QUALITY)
+                    .encode_image(picture.as_ref())
+                    .map_err(io::Error::other)
+            })?;
+            let depth = clipped_depth(street, sequence, frame);
+            write_depth_png(frames.join(format!("depth/{frame:06}.png")), &depth)?;
+        }
+    }
+    Ok(())
+}
+
+/// Quality of JPEG frames, of 100: as cameras store them.
+const JPEG_QUALITY: u8 = 92;
+
+fn refuse_what_is_there(out: &Path) -> Result<()> {
+    match fs::read_dir(out).is_ok_and(|mut entries| entries.next().is_some()) {
+        true => {
+            Err(Error::file(out, "the folder is not empty; give a new one, or empty it first: nothing was written"))
+        }
+        false => Ok(()),
+    }
+}
+
+/// The depth of a frame, as far as a depth PNG holds it.
+fn clipped_depth(street: &Street, sequence: usize, frame: usize) -> DepthMap {
+    let mut depth = street.frame_depth(sequence, frame);
+    depth.metres.iter_mut().for_each(|z| *z = z.min(DEEPEST));
+    depth
 }
 
 fn folder(path: &Path) -> Result<()> {
@@ -147,6 +199,33 @@ mod tests {
 
         let again = write(&street, &out).unwrap_err().to_string();
         assert!(again.contains("not empty") && again.contains("street"), "{again}");
+    }
+
+    #[test]
+    fn frames_come_with_their_camera_and_their_depth() {
+        use crate::camera::Intrinsics;
+        use crate::data::{Opening, open_folder};
+        // 4:3, wide, off centre.
+        let intrinsics = Intrinsics { fx: 0.7, fy: 0.7 * 4.0 / 3.0, cx: 0.46, cy: 0.55 };
+        let config =
+            StreetConfig { height: 96, width: 128, sequences: 2, frames: 4, intrinsics, ..StreetConfig::default() };
+        let street = Street::render(&config, None);
+        let place = tempfile::tempdir().unwrap();
+        let out = place.path().join("frames");
+        write_frames(&street, &out).unwrap();
+        let data = open_folder(&out, Opening::of([32, 96])).unwrap();
+        assert_eq!(data.len(), 4);
+        let k = crate::data::batch::in_pixels(data.intrinsics(0), 96, 32);
+        let said = [0.7 * 128.0, 0.7 * 128.0, 0.46 * 128.0, 0.55 * 96.0];
+        let scaled = [said[0] * 96.0 / 128.0, said[1] * 32.0 / 96.0, said[2] * 96.0 / 128.0, said[3] * 32.0 / 96.0];
+        assert!(k.iter().zip(scaled).all(|(a, b)| (a - b).abs() < 1e-9), "{k:?} {scaled:?}");
+        let (found, truth) = (data.depth(3).unwrap().unwrap(), street.frame_depth(1, 2));
+        assert!(found.metres.iter().zip(&truth.metres).all(|(a, b)| (a - b.min(250.0)).abs() <= 0.5 / 256.0));
+        let jpeg = crate::formats::picture::read_picture(&out.join("0001/000002.jpg")).unwrap();
+        let off = jpeg.as_raw().iter().zip(street.frame(1, 2).as_raw()).map(|(a, b)| f64::from(a.abs_diff(*b)));
+        assert!(off.sum::<f64>() / (3.0 * 96.0 * 128.0) < 5.0, "about the same picture");
+        let again = write_frames(&street, &out).unwrap_err().to_string();
+        assert!(again.contains("not empty"), "{again}");
     }
 
     #[test]

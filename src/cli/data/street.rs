@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use parallax::camera::Intrinsics;
 use parallax::street::{Street, StreetConfig, export};
 use parallax::{Error, Result};
 
@@ -27,12 +28,25 @@ pub struct Args {
     /// Seed of everything random.
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// The files' layout: that of KITTI raw (PNG), or a folder of JPEG frames for each sequence, with camera.toml.
+    #[arg(long, value_enum, default_value_t = Layout::Kitti)]
+    layout: Layout,
+    /// Focal lengths and principal point of the camera, in pixels [default: KITTI's, for any size].
+    #[arg(long, value_name = "FX,FY,CX,CY", value_parser = crate::cli::pinhole)]
+    intrinsics: Option<[f64; 4]>,
     /// A second camera so far to the right, image_03: 0.54 is KITTI's distance [default: one camera].
     #[arg(long, value_name = "METRES")]
     baseline: Option<f64>,
     /// Add moving cars.
     #[arg(long)]
     moving_cars: bool,
+}
+
+/// How a street is written.
+#[derive(Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Layout {
+    Kitti,
+    Frames,
 }
 
 /// Pictures that a street may consist of.
@@ -52,6 +66,9 @@ pub fn run(a: Args) -> Result<()> {
     if a.baseline.is_some_and(|b| !(b > 0.0 && b <= 10.0)) {
         return Err(Error::setting("--baseline", format!("{baseline} is not a distance above 0, up to 10 metres")));
     }
+    if baseline > 0.0 && a.layout == Layout::Frames {
+        return Err(Error::setting("--baseline", "folders of frames hold one camera: take --layout kitti"));
+    }
     let cameras = if baseline > 0.0 { 2 } else { 1 };
     // All pictures are held until they are written.
     let gigabytes =
@@ -70,7 +87,12 @@ pub fn run(a: Args) -> Result<()> {
         seed: a.seed,
         moving_cars: a.moving_cars,
         baseline,
-        ..StreetConfig::default()
+        intrinsics: a.intrinsics.map_or(Intrinsics::KITTI, |k| Intrinsics {
+            fx: k[0] / a.width as f64,
+            fy: k[1] / a.height as f64,
+            cx: k[2] / a.width as f64,
+            cy: k[3] / a.height as f64,
+        }),
     };
     let progress = std::sync::Mutex::new(Progress::new("frames", (cameras * a.sequences * a.frames) as u64));
     let report = |done: usize, _: usize| {
@@ -79,7 +101,10 @@ pub fn run(a: Args) -> Result<()> {
         }
     };
     let street = Street::render(&config, Some(&report));
-    export::write(&street, &a.out)?;
+    match a.layout {
+        Layout::Kitti => export::write(&street, &a.out)?,
+        Layout::Frames => export::write_frames(&street, &a.out)?,
+    }
     if let Ok(progress) = progress.lock() {
         progress.finish();
     }
