@@ -18,6 +18,7 @@ mod control;
 mod convert;
 mod data;
 mod eval;
+mod film;
 mod gradcheck;
 mod info;
 mod predict;

@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use image::RgbImage;
 use parallax::camera::Intrinsics;
+use parallax::data::film::{is_film, make_film};
 use parallax::data::inputs::{Input, find_pictures};
 use parallax::data::resize::lanczos;
 use parallax::depth::InverseDepth;
@@ -22,6 +23,7 @@ use parallax::weights::Weights;
 use parallax::{Error, Result};
 use serde::Serialize;
 
+use super::film::FilmArgs;
 use super::progress::Progress;
 use super::sizes::Numbers;
 
@@ -34,13 +36,18 @@ use outputs::{Job, Outputs, jobs};
 pub struct Args {
     #[command(flatten)]
     weights: super::weights::WeightsArgs,
-    /// Pictures (PNG, JPEG, WebP), or folders of them.
+    /// Pictures (PNG, JPEG, WebP), folders of them, or films (mp4, mov, mkv, ...; read by ffmpeg, if installed).
     ///
     /// Of a folder everything below it, frame2 before frame10; hidden files and links to folders are
     /// passed over. Pictures of any size up to 100 megapixels, turned as their EXIF orientation says;
     /// alpha is ignored.
     #[arg(required = true, value_name = "INPUT", verbatim_doc_comment)]
     inputs: Vec<PathBuf>,
+    #[command(flatten)]
+    film_args: FilmArgs,
+    /// Also make a film of every film's maps: FILM_disp.mp4 in the folder for the results.
+    #[arg(long, help_heading = "Results")]
+    film: bool,
     /// Folder for the results; created if it is missing.
     ///
     /// A picture's results bear its name; those of a folder lie as its pictures do. With several inputs
@@ -163,9 +170,16 @@ struct Failure {
 
 pub fn run(args: Args) -> Result<()> {
     let started = Instant::now();
-    let found = find_pictures(&args.inputs, &args.out)?;
+    let inputs = args.film_args.folders(&args.inputs)?;
+    let films = films(&args, &inputs)?;
+    let found = find_pictures(&inputs, &args.out)?;
     tell_skipped(&found.skipped);
-    let (jobs, there) = left_to_do(jobs(found.pictures, &args)?, args.skip_existing);
+    let jobs = jobs(found.pictures, &args)?;
+    let maps: Vec<(PathBuf, PathBuf)> = match args.film {
+        true => jobs.iter().map(|job| (job.input.path.clone(), job.outputs.disparity.clone())).collect(),
+        false => Vec::new(),
+    };
+    let (jobs, there) = left_to_do(jobs, args.skip_existing);
     let Weights { model, params, setup, .. } = args.weights.load()?;
     let made = !args.out.exists();
     check_writable(&args.out)?;
@@ -192,6 +206,11 @@ pub fn run(args: Args) -> Result<()> {
     {
         note!("the median factor is {factor:.3}: --scale {factor:.3} gives all pictures the same");
     }
+    for (folder, film) in &films {
+        let of_film = maps.iter().filter(|(picture, map)| picture.starts_with(folder) && map.is_file());
+        make_film(&of_film.map(|(_, map)| map.clone()).collect::<Vec<_>>(), args.film_args.rate(), film)?;
+        note!("the maps as a film: {}", film.display());
+    }
     let (all, failures) = (done.len() + failed.len(), failed.len());
     if args.json {
         let (weights, seconds) = (args.weights.name(), started.elapsed().as_secs_f64());
@@ -206,6 +225,23 @@ pub fn run(args: Args) -> Result<()> {
     match failures {
         0 => Ok(()),
         n => Err(Error::Failed(format!("{n} of {all} pictures could not be done (see above)"))),
+    }
+}
+
+/// The films to be made of maps: of which folder of frames, and where.
+fn films(args: &Args, folders: &[PathBuf]) -> Result<Vec<(PathBuf, PathBuf)>> {
+    if !args.film {
+        return Ok(Vec::new());
+    }
+    let films = args.inputs.iter().zip(folders).filter(|(film, _)| is_film(film));
+    let made = films.map(|(film, folder)| {
+        let mut name = film.file_stem().unwrap_or_default().to_owned();
+        name.push("_disp.mp4");
+        (folder.clone(), args.out.join(name))
+    });
+    match made.collect::<Vec<_>>() {
+        none if none.is_empty() => Err(Error::setting("--film", "makes films of films, and none is given")),
+        films => Ok(films),
     }
 }
 

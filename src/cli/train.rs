@@ -20,18 +20,24 @@ use parallax::{Error, Result};
 use super::ablation;
 use super::camera::CameraArgs;
 use super::control::Control;
+use super::film::FilmArgs;
 use super::progress::Progress;
 use super::stereo::StereoArgs;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Training frames: `street` (rendered by the program) or a folder [default: street].
+    /// Training frames: `street` (rendered by the program), a folder or a film [default: street].
     ///
     /// A folder in the layout of KITTI raw; or any folder of PNG, JPEG or WebP frames, in the order in which people number
     /// them, each folder inside it a sequence of its own. `camera.toml` among the frames says which camera took them.
     /// Depth maps, if there are any, lie in a folder `depth` beside the frames, under their names.
-    #[arg(long, value_name = "street|DIR")]
+    ///
+    /// A film (mp4, mov, mkv, ...) is read by ffmpeg, which has to be installed: --fps frames a second are taken out into a
+    /// folder beside it, which is what the run then trains on.
+    #[arg(long, value_name = "street|DIR|FILM")]
     data: Option<String>,
+    #[command(flatten)]
+    film: FilmArgs,
     /// List of a folder's frames to train on, lines `FOLDER FRAME`, or of KITTI raw `FOLDER FRAME SIDE`
     /// [default: all that have both neighbours].
     #[arg(long, value_name = "FILE")]
@@ -263,6 +269,9 @@ fn create(args: &Args) -> Result<(Run, RunData)> {
         }
     }
     frozen(&start.params, &config.freeze)?;
+    if config.data != STREET {
+        config.data = args.film.folder(Path::new(&config.data))?.to_string_lossy().into_owned();
+    }
     let folder = args.out.clone().unwrap_or_else(|| next_free("runs"));
     let made = !folder.exists();
     Run::claim(&folder)?;
@@ -352,6 +361,7 @@ impl Args {
             ("--intrinsics", self.lens.intrinsics.is_some()),
             ("--camera", self.lens.camera.is_some()),
             ("--allow-partial", self.allow_partial),
+            ("--fps", self.film.fps.is_some()),
             ("--log-every", self.log_every.is_some()),
             ("--checkpoint-every", self.checkpoint_every.is_some()),
             ("--sources or --baseline", self.stereo.any()),

@@ -8,6 +8,7 @@ mod cache;
 pub mod camera;
 pub mod camera_fit;
 pub mod check;
+pub mod film;
 pub mod frames;
 pub mod inputs;
 
@@ -148,8 +149,7 @@ impl Opening<'_> {
 pub fn open_folder(root: &Path, opening: Opening) -> Result<Arc<dyn DataSource>> {
     let Opening { list, size, camera, skip_bad_frames, sources, prepared, cache_bytes } = opening;
     if root.is_file() {
-        let message = "is a file: make a folder of frames of a film, for example with ffmpeg -i FILM -qscale:v 2 -vf \
-                       fps=10 FRAMES/%06d.jpg";
+        let message = "is a file: expected a folder of frames (of a film, see data::film)";
         return Err(Error::file(root, message));
     }
     if !root.is_dir() {

@@ -13,13 +13,16 @@ use parallax::{Error, Result};
 use serde::Serialize;
 
 use crate::cli::camera::CameraArgs;
+use crate::cli::film::FilmArgs;
 use crate::cli::progress::Progress;
 use crate::cli::sizes::Sizes;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// The folder: in the layout of KITTI raw, or of frames, as train takes it.
+    /// The folder: in the layout of KITTI raw, or of frames, as train takes it; or a film.
     dir: PathBuf,
+    #[command(flatten)]
+    film: FilmArgs,
     /// List of its frames [default: all that have both neighbours].
     #[arg(long, value_name = "FILE")]
     split: Option<PathBuf>,
@@ -61,7 +64,9 @@ struct Step {
 }
 
 /// Says what a folder holds, what keeps one from training on it, and what should be looked at.
-pub fn run(args: &Args) -> Result<()> {
+pub fn run(mut args: Args) -> Result<()> {
+    args.dir = args.film.folder(&args.dir)?;
+    let args = &args;
     args.sizes.check()?;
     let report = look(args)?;
     if args.sizes.json {

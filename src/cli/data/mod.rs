@@ -32,7 +32,7 @@ enum What {
 pub fn run(args: Args) -> Result<()> {
     match args.what {
         What::Street(args) => street::run(args),
-        What::Check(args) => check::run(&args),
-        What::Prepare(args) => prepare::run(&args),
+        What::Check(args) => check::run(args),
+        What::Prepare(args) => prepare::run(args),
     }
 }

@@ -7,12 +7,15 @@ use parallax::data::prepared::prepare;
 use parallax::monovit::setup::check_size;
 use parallax::{Error, Result};
 
+use crate::cli::film::FilmArgs;
 use crate::cli::progress::Progress;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// The folder of frames, as train takes it.
+    /// The folder of frames, or the film, as train takes it.
     dir: PathBuf,
+    #[command(flatten)]
+    film: FilmArgs,
     /// The file to write [default: frames-WIDTHxHEIGHT.prepared in the folder, where train looks for it].
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
@@ -24,7 +27,9 @@ pub struct Args {
     width: usize,
 }
 
-pub fn run(args: &Args) -> Result<()> {
+pub fn run(mut args: Args) -> Result<()> {
+    args.dir = args.film.folder(&args.dir)?;
+    let args = &args;
     check_size("--height", args.height)?;
     check_size("--width", args.width)?;
     let progress: Mutex<Option<Progress>> = Mutex::new(None);
