@@ -81,7 +81,7 @@ pub struct Args {
     #[arg(long, value_name = "N")]
     epochs: Option<u64>,
     /// Learning rate of the depth decoder; those of the encoder and of the pose networks keep their ratio to it
-    /// [default: 0.001, or 0.0001 where training starts from weights].
+    /// [default: 0.001, or 0.0001 where networks of a published size start from weights].
     #[arg(long, value_name = "RATE")]
     learning_rate: Option<f64>,
     /// Seed of everything random [default: 0].

@@ -279,8 +279,10 @@ impl RunConfig {
         }
     }
 
-    /// The recipe for a start from trained weights: the published learning rates of depth (MonoViT, section 4.1), pictures
-    /// of the weights' own size, and nothing of what random weights need.
+    /// The recipe for a start from trained weights: pictures of the weights' own size, and nothing of what random weights
+    /// need. Depth learns at the published rates (MonoViT, section 4.1) in networks of the published sizes, which get many
+    /// thousand steps; the reduced ones go on at the rates they learn at from scratch, and with auto-masking as late as
+    /// there, because until the new motion is known it would leave little to learn from.
     ///
     /// The pose networks learn faster, and alone at first. They know the motion of another camera: where that moved three
     /// times as far between two frames, depths of three times the distance explain the new pictures, and depth gets there
@@ -288,16 +290,20 @@ impl RunConfig {
     pub fn from_weights(setup: Setup, steps: u64) -> Self {
         let Setup { preset, ablation, height, width, min_depth, max_depth } = setup;
         let scratch = Self::new(preset, steps);
+        let reduced = matches!(preset, Preset::Pico | Preset::Nano);
         RunConfig {
             ablation,
             height,
             width,
             initial_disparity: None,
-            auto_mask_delay: 0.0,
+            auto_mask_delay: if reduced { scratch.auto_mask_delay } else { 0.0 },
             loss: LossConfig { min_depth, max_depth, ..scratch.loss },
             rotations: Rotations::default(),
             pose_first: 0.3,
-            optim: OptimConfig { encoder_rate: 5e-5, rate: 1e-4, pose_rate: 1e-3, ..scratch.optim },
+            optim: match reduced {
+                true => OptimConfig { pose_rate: scratch.optim.rate, ..scratch.optim },
+                false => OptimConfig { encoder_rate: 5e-5, rate: 1e-4, pose_rate: 1e-3, ..scratch.optim },
+            },
             ..scratch
         }
     }
@@ -458,8 +464,10 @@ mod tests {
     }
 
     #[test]
-    fn from_trained_weights_the_pose_networks_learn_first_and_depth_at_the_published_rates() {
-        let config = RunConfig::from_weights(Setup::of(Preset::Nano), 300);
+    fn from_trained_weights_the_pose_networks_learn_first_and_depth_at_the_rates_of_its_size() {
+        let optim = RunConfig::from_weights(Setup::of(Preset::Nano), 300).optim;
+        assert_eq!((optim.encoder_rate, optim.rate, optim.pose_rate), (1e-3, 1e-3, 1e-3));
+        let config = RunConfig::from_weights(Setup::of(Preset::Small), 300);
         assert_eq!((config.plan().pose_first, config.plan().rotations.steps), (90, 0));
         let optim = config.optim;
         assert!(optim.encoder_rate == 5e-5 && optim.rate == 1e-4 && optim.pose_rate > optim.rate);
