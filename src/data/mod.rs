@@ -149,7 +149,7 @@ impl Opening<'_> {
 pub fn open_folder(root: &Path, opening: Opening) -> Result<Arc<dyn DataSource>> {
     let Opening { list, size, camera, skip_bad_frames, sources, prepared, cache_bytes } = opening;
     if root.is_file() {
-        let message = "is a file: expected a folder of frames (of a film, see data::film)";
+        let message = "is a file: expected a folder of frames, or a film (mp4, mov, mkv, ...) for ffmpeg to take apart";
         return Err(Error::file(root, message));
     }
     if !root.is_dir() {

@@ -93,7 +93,8 @@ pub const CHECKS: [Check; 8] = [
         name: "disparity collapsed",
         figure: "standard deviation of the disparity over its mean",
         limit: Limit::Below(0.02),
-        lines: FEW,
+        // Before it has learnt anything a network predicts one depth, too.
+        lines: MANY,
         meaning: "the depth network predicts the same depth for every pixel",
         advice: "take a lower --learning-rate, or start again with another --seed",
         measure: |w| Some(w.median(|line| line.vitals.disparity_spread)),
