@@ -11,6 +11,7 @@ use parallax::data::resize::lanczos;
 use parallax::depth::InverseDepth;
 use parallax::eval::camera_height::find_ground;
 use parallax::eval::metrics::{STEREO_SCALE, median};
+use parallax::eval::odometry::Odometry;
 use parallax::eval::predictor::Predictor;
 use parallax::formats::atomic::check_writable;
 use parallax::formats::depth_png::write_depth_png;
@@ -19,7 +20,7 @@ use parallax::formats::picture::read_picture;
 use parallax::formats::ply::write_point_cloud;
 use parallax::formats::png::write_png;
 use parallax::report::colormap::disparity_to_image;
-use parallax::weights::Weights;
+use parallax::weights::{Need, Weights};
 use parallax::{Error, Result};
 use serde::Serialize;
 
@@ -28,6 +29,7 @@ use super::progress::Progress;
 use super::sizes::Numbers;
 
 mod outputs;
+mod paths;
 
 use outputs::{Job, Outputs, jobs};
 
@@ -73,6 +75,12 @@ pub struct Args {
     /// Also NAME.ply: every pixel as a coloured point; x right, y down, z forward.
     #[arg(long, help_heading = "Results")]
     ply: bool,
+    /// Also poses.txt for every folder or film: the camera's path, by the pose network, as `eval --poses` compares it.
+    ///
+    /// A line for each frame, in order: the rows of [R | C], from its camera to the first one's (x right, y down, z forward),
+    /// in the unit of depth. Frames of a folder have to follow one another.
+    #[arg(long, help_heading = "Results", conflicts_with = "camera_height")]
+    poses: bool,
     /// Leave pictures alone whose results are all there.
     #[arg(long)]
     skip_existing: bool,
@@ -179,8 +187,10 @@ pub fn run(args: Args) -> Result<()> {
         true => jobs.iter().map(|job| (job.input.path.clone(), job.outputs.disparity.clone())).collect(),
         false => Vec::new(),
     };
+    let paths = if args.poses { paths::of(&jobs, &args.out)? } else { Vec::new() };
     let (jobs, there) = left_to_do(jobs, args.skip_existing);
-    let Weights { model, params, setup, .. } = args.weights.load()?;
+    let need = if args.poses { Need::All } else { Need::Depth };
+    let Weights { model, params, setup, .. } = args.weights.load_with(need)?;
     let made = !args.out.exists();
     check_writable(&args.out)?;
     let predictor = Predictor::new(&model, &params, &setup).with_precision(args.precision.checked()?)?;
@@ -205,6 +215,13 @@ pub fn run(args: Args) -> Result<()> {
         && let Some(factor) = median(done.iter().map(|picture| picture.factor).collect())
     {
         note!("the median factor is {factor:.3}: --scale {factor:.3} gives all pictures the same");
+    }
+    let odometry = Odometry::new(&model, &params, &setup);
+    for path in &paths {
+        if let Err(error) = path.write(&odometry, args.factor_of_all()) {
+            note!("parallax: {error}");
+            failed.push(Failure { input: path.file.to_string_lossy().into_owned(), error: error.to_string() });
+        }
     }
     for (folder, film) in &films {
         let of_film = maps.iter().filter(|(picture, map)| picture.starts_with(folder) && map.is_file());
@@ -312,11 +329,14 @@ impl Args {
         Intrinsics { fx: fx / width, fy: fy / height, cx: cx / width, cy: cy / height }
     }
 
+    /// What all depths are multiplied by, where pictures have no factor of their own.
+    fn factor_of_all(&self) -> f64 {
+        if self.stereo { STEREO_SCALE } else { self.scale.unwrap_or(1.0) }
+    }
+
     /// What a picture's depths are multiplied by; `map` is its inverse depth as predicted.
     fn factor(&self, input: &Input, map: &[f32], size: (usize, usize), camera: Intrinsics) -> Result<f64> {
-        let Some(metres) = self.camera_height else {
-            return Ok(if self.stereo { STEREO_SCALE } else { self.scale.unwrap_or(1.0) });
-        };
+        let Some(metres) = self.camera_height else { return Ok(self.factor_of_all()) };
         let ground = find_ground(map, size, camera).ok_or_else(|| {
             let message = "no road was found to measure the camera's height over: give --scale instead, or the \
                            camera's --intrinsics or --fov if it is not KITTI's";

@@ -46,8 +46,13 @@ impl WeightsArgs {
 
     /// The weights that were asked for, to predict depth with.
     pub fn load(&self) -> Result<Weights> {
+        self.load_with(Need::Depth)
+    }
+
+    /// The weights that were asked for, with the networks that are needed.
+    pub fn load_with(&self, need: Need) -> Result<Weights> {
         self.check()?;
-        let mut weights = weights::load(&self.weights, Need::Depth, self.allow_partial)?;
+        let mut weights = weights::load(&self.weights, need, self.allow_partial)?;
         let averaged = weights.report.skipped.iter().find(|s| s.what.contains("averaged"));
         if weights.report.problem().is_some() {
             note!("{}", weights.report);

@@ -12,6 +12,7 @@ pub mod flip;
 pub mod folder;
 pub mod mean_map;
 pub mod metrics;
+pub mod odometry;
 pub mod predictions;
 pub mod predictor;
 pub mod projected;
