@@ -50,6 +50,22 @@ fn pairs_alone_need_no_lessons_of_rotations() {
     assert_eq!((plan.rotations.steps, plan.rotations.keep), (0, 0));
 }
 
+/// Where neighbours explain every pixel better than a pair that depth does not fit yet, the pair is listened to at first.
+#[test]
+fn pairs_have_a_loss_of_their_own_before_they_share_one() {
+    let batch = batch_of_step(&street(), making(Sources::Both), 2, 0, 0).expect("a batch");
+    let loss = |pairs_apart: f64, nearer: f64| {
+        let config = RunConfig { pairs_apart, ..config(Sources::Both) };
+        let mut trainer = Trainer::new(config.model(), config.plan());
+        let mut batch = batch.clone();
+        batch.shifts.iter_mut().flatten().for_each(|x| *x *= nearer);
+        trainer.step(&batch).expect("a step").loss
+    };
+    assert!(loss(1.0, 1.0) > loss(0.0, 1.0), "the mean of two minima is above the minimum over all");
+    assert_eq!(config(Sources::Both).plan().pairs_apart, 3);
+    assert!(loss(1.0, 1.0) != loss(1.0, 0.5));
+}
+
 /// The error of a pair is that of its own warp: another baseline, or the other camera's picture exchanged, changes it,
 /// and the minimum over three sources is at most that over two.
 #[test]

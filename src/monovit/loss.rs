@@ -1,6 +1,8 @@
 //! The self-supervised loss (MonoViT, section 3.4; Monodepth2, section 3): how well the neighbours, warped into the
 //! target by the predicted depth and motion, look like it.
 
+use std::ops::Range;
+
 use serde::{Deserialize, Serialize};
 
 use super::setup::check_depths;
@@ -107,6 +109,21 @@ pub struct Views<T: Float> {
     pub intrinsics: Vec<[f64; 4]>,
 }
 
+impl<T: Float> Views<T> {
+    /// The same targets with some of the sources.
+    ///
+    /// # Panics
+    /// If there are not so many.
+    pub fn of_sources(&self, which: Range<usize>) -> Self {
+        Views {
+            pyramid: self.pyramid.clone(),
+            sources: self.sources[which.clone()].to_vec(),
+            smaller_sources: self.smaller_sources.iter().map(|sources| sources[which.clone()].to_vec()).collect(),
+            intrinsics: self.intrinsics.clone(),
+        }
+    }
+}
+
 /// The loss and what it is made of (means over the scales).
 pub struct Loss<T: Float> {
     /// The total loss, a scalar: what training minimises.
@@ -121,6 +138,21 @@ pub struct Loss<T: Float> {
     pub smoothness: f64,
     /// Share of pixels that auto-masking leaves in: those that a warped neighbour explains best.
     pub auto_mask: f64,
+}
+
+impl<T: Float> Loss<T> {
+    /// The mean of two losses of the same disparities, and of all they are made of.
+    pub fn and(self, other: Self) -> Self {
+        let mean = |of: fn(&Self) -> f64| 0.5 * (of(&self) + of(&other));
+        Loss {
+            photometric: mean(|loss| loss.photometric),
+            warped: mean(|loss| loss.warped),
+            unwarped: mean(|loss| loss.unwarped),
+            smoothness: mean(|loss| loss.smoothness),
+            auto_mask: mean(|loss| loss.auto_mask),
+            total: (&self.total + &other.total).affine(0.5, 0.0),
+        }
+    }
 }
 
 /// Gaussian noise that breaks ties, drawn once; every use starts at a random place in it.
@@ -327,6 +359,22 @@ mod tests {
         assert!((found - 0.5 * (first + second)).abs() < 1e-12, "{found} for {first} and {second}");
         let full = loss(&disparities, &transforms, &views, &LossConfig { scales: Scales::Full, ..own }, None);
         assert!((found - full.photometric).abs() > 1e-6, "not the same as at full size");
+    }
+
+    #[test]
+    fn two_losses_join_into_their_mean() {
+        let (disparities, transforms, views) = noise();
+        let config = LossConfig::default();
+        let of = |which: Range<usize>| {
+            loss(&disparities, &transforms[which.clone()], &views.of_sources(which), &config, None)
+        };
+        let (first, second, both) = (of(0..1), of(1..2), of(0..1).and(of(1..2)));
+        let value = |loss: &Loss<f64>| loss.total.value().item();
+        assert!((value(&both) - 0.5 * (value(&first) + value(&second))).abs() < 1e-15);
+        assert!((both.photometric - 0.5 * (first.photometric + second.photometric)).abs() < 1e-15);
+        assert!((both.auto_mask - 0.5 * (first.auto_mask + second.auto_mask)).abs() < 1e-15);
+        let together = loss(&disparities, &transforms, &views, &config, None);
+        assert!(together.photometric < both.photometric, "the least over both is less");
     }
 
     #[test]

@@ -233,8 +233,19 @@ impl Trainer {
         let mut random = Random::of(self.plan.seed, Stream::Ties(pass));
         let auto_mask = self.plan.loss.auto_mask && step >= self.plan.auto_mask_after;
         let config = LossConfig { auto_mask, ..self.plan.loss };
-        let found =
-            loss(&disparities, &transforms, &views(batch, config.scales), &config, Some((&self.ties, &mut random)));
+        let all = views(batch, config.scales);
+        let mut loss_of = |transforms: &[Var<f32>], views: &Views<f32>| {
+            loss(&disparities, transforms, views, &config, Some((&self.ties, &mut random)))
+        };
+        // Pairs and neighbours apart, at first; then a pixel's least error over all of them.
+        let apart = batch.neighbours.is_some() && batch.shifts.is_some() && step < self.plan.pairs_apart;
+        let found = if apart {
+            let pair = all.sources.len() - 1;
+            let in_time = loss_of(&transforms[..pair], &all.of_sources(0..pair));
+            in_time.and(loss_of(&transforms[pair..], &all.of_sources(pair..pair + 1)))
+        } else {
+            loss_of(&transforms, &all)
+        };
         let disparity = disparities[0].value().clone();
         let transforms = transforms.iter().map(|t| t.value().clone()).collect();
         Forward { c, found, disparity, transforms }
