@@ -113,8 +113,8 @@ pub struct Plan {
     pub accumulate: usize,
     /// The number of steps in which the pose networks learn alone.
     pub pose_first: u64,
-    /// The number of steps in which pairs and neighbours in time each have a loss of their own, where there are both.
-    pub pairs_apart: u64,
+    /// The number of steps in which depth learns from pairs alone, where there are neighbours in time as well.
+    pub pairs_first: u64,
     /// Known rotations for the pose network.
     pub rotations: RotationPlan,
     /// Whether transformer layers are computed again in the backward pass.
@@ -161,11 +161,12 @@ pub struct RunConfig {
     /// The unit of the distance between two cameras: with the calibrated one depth is in metres.
     #[serde(default)]
     pub baseline: Baseline,
-    /// Training on neighbours in time and a second camera: the share of the steps in which each has a loss of its own,
-    /// before a pixel's least error over all of them counts. While depth is of another scale than the baseline, neighbours
-    /// explain every pixel better than the second camera does, which would never be listened to.
-    #[serde(default = "pairs_apart")]
-    pub pairs_apart: f64,
+    /// Training on neighbours in time and a second camera: the share of the steps in which depth learns from the second
+    /// camera alone, and the pose networks the motion that belongs to it; then a pixel's least error over all of them
+    /// counts. While depth is of another scale than the baseline, neighbours explain every pixel better than the second
+    /// camera does, which would never be listened to.
+    #[serde(default = "pairs_first")]
+    pub pairs_first: f64,
     /// Whether samples with a frame that cannot be read are passed over and counted; they end the run otherwise.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub skip_bad_frames: bool,
@@ -230,7 +231,7 @@ pub struct RunConfig {
 }
 
 /// The usual share, for configurations from before there was one.
-fn pairs_apart() -> f64 {
+fn pairs_first() -> f64 {
     0.3
 }
 
@@ -257,7 +258,7 @@ impl RunConfig {
             camera: Camera::Auto,
             sources: Sources::Mono,
             baseline: Baseline::Calibrated,
-            pairs_apart: pairs_apart(),
+            pairs_first: pairs_first(),
             skip_bad_frames: false,
             prepared: None,
             init: Vec::new(),
@@ -350,7 +351,7 @@ impl RunConfig {
             accumulate: self.accumulate,
             // Pairs tell depth its scale, which no pose network has to learn first.
             pose_first: if self.sources == Sources::Mono { steps_of(self.pose_first, self.steps) } else { 0 },
-            pairs_apart: steps_of(self.pairs_apart, self.steps),
+            pairs_first: steps_of(self.pairs_first, self.steps),
             rotations: match self.sources.in_time() {
                 true => self.rotations.over(self.steps),
                 // No pose network is asked.
@@ -403,7 +404,7 @@ impl RunConfig {
         }
         check_share("pose_first", self.pose_first)?;
         check_share("auto_mask_delay", self.auto_mask_delay)?;
-        check_share("pairs_apart", self.pairs_apart)?;
+        check_share("pairs_first", self.pairs_first)?;
         self.loss.check()?;
         self.rotations.check()?;
         self.optim.check()?;

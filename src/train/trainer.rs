@@ -234,17 +234,19 @@ impl Trainer {
         let auto_mask = self.plan.loss.auto_mask && step >= self.plan.auto_mask_after;
         let config = LossConfig { auto_mask, ..self.plan.loss };
         let all = views(batch, config.scales);
-        let mut loss_of = |transforms: &[Var<f32>], views: &Views<f32>| {
-            loss(&disparities, transforms, views, &config, Some((&self.ties, &mut random)))
-        };
-        // Pairs and neighbours apart, at first; then a pixel's least error over all of them.
-        let apart = batch.neighbours.is_some() && batch.shifts.is_some() && step < self.plan.pairs_apart;
-        let found = if apart {
-            let pair = all.sources.len() - 1;
-            let in_time = loss_of(&transforms[..pair], &all.of_sources(0..pair));
-            in_time.and(loss_of(&transforms[pair..], &all.of_sources(pair..pair + 1)))
+        let mut loss_of =
+            |disparities: &[Var<f32>], transforms: &[Var<f32>], views: &Views<f32>, config: &LossConfig| {
+                loss(disparities, transforms, views, config, Some((&self.ties, &mut random)))
+            };
+        let found = if batch.neighbours.is_some() && batch.shifts.is_some() && step < self.plan.pairs_first {
+            // Depth learns from the pairs alone, also where it is so far off that the unwarped picture fits better; the pose
+            // networks learn the motion that belongs to this depth.
+            let (pair, known) = (all.sources.len() - 1, disparities.iter().map(Var::detach).collect::<Vec<_>>());
+            let in_time = loss_of(&known, &transforms[..pair], &all.of_sources(0..pair), &config);
+            let unmasked = LossConfig { auto_mask: false, ..config };
+            in_time.and(loss_of(&disparities, &transforms[pair..], &all.of_sources(pair..pair + 1), &unmasked))
         } else {
-            loss_of(&transforms, &all)
+            loss_of(&disparities, &transforms, &all, &config)
         };
         let disparity = disparities[0].value().clone();
         let transforms = transforms.iter().map(|t| t.value().clone()).collect();
