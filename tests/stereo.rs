@@ -72,7 +72,7 @@ fn depth_learns_from_pairs_alone_before_they_share_a_loss_with_neighbours() {
     let changed = step(1.0, &nearer);
     assert!(changed[0] != encoder && changed[1] != decoder && changed[2] == pose, "{changed:?}");
     assert!(step(0.0, &grey)[0] != step(0.0, &|_| ())[0], "later neighbours teach depth, too");
-    assert_eq!(config(Sources::Both).plan().pairs_first, 3);
+    assert_eq!(config(Sources::Both).plan().pairs_first, 5);
 }
 
 /// The error of a pair is that of its own warp: another baseline, or the other camera's picture exchanged, changes it,

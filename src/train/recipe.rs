@@ -232,7 +232,7 @@ pub struct RunConfig {
 
 /// The usual share, for configurations from before there was one.
 fn pairs_first() -> f64 {
-    0.3
+    0.5
 }
 
 impl RunConfig {

@@ -234,19 +234,16 @@ impl Trainer {
         let auto_mask = self.plan.loss.auto_mask && step >= self.plan.auto_mask_after;
         let config = LossConfig { auto_mask, ..self.plan.loss };
         let all = views(batch, config.scales);
-        let mut loss_of =
-            |disparities: &[Var<f32>], transforms: &[Var<f32>], views: &Views<f32>, config: &LossConfig| {
-                loss(disparities, transforms, views, config, Some((&self.ties, &mut random)))
-            };
+        let mut loss_of = |disparities: &[Var<f32>], transforms: &[Var<f32>], views: &Views<f32>| {
+            loss(disparities, transforms, views, &config, Some((&self.ties, &mut random)))
+        };
         let found = if batch.neighbours.is_some() && batch.shifts.is_some() && step < self.plan.pairs_first {
-            // Depth learns from the pairs alone, also where it is so far off that the unwarped picture fits better; the pose
-            // networks learn the motion that belongs to this depth.
+            // Depth learns from the pairs alone, and the pose networks the motion that belongs to this depth.
             let (pair, known) = (all.sources.len() - 1, disparities.iter().map(Var::detach).collect::<Vec<_>>());
-            let in_time = loss_of(&known, &transforms[..pair], &all.of_sources(0..pair), &config);
-            let unmasked = LossConfig { auto_mask: false, ..config };
-            in_time.and(loss_of(&disparities, &transforms[pair..], &all.of_sources(pair..pair + 1), &unmasked))
+            let in_time = loss_of(&known, &transforms[..pair], &all.of_sources(0..pair));
+            in_time.and(loss_of(&disparities, &transforms[pair..], &all.of_sources(pair..pair + 1)))
         } else {
-            loss_of(&disparities, &transforms, &all, &config)
+            loss_of(&disparities, &transforms, &all)
         };
         let disparity = disparities[0].value().clone();
         let transforms = transforms.iter().map(|t| t.value().clone()).collect();
