@@ -87,7 +87,7 @@ pub fn write_frames(street: &Street, out: &Path) -> Result<()> {
         folder(&frames.join("depth"))?;
         for frame in 0..config.frames {
             let picture = street.frame(sequence, frame);
-            write_atomically(&frames.join(format!("{frame:06}.jpg")), |file| {
+            write_atomically(frames.join(format!("{frame:06}.jpg")), |file| {
                 JpegEncoder::new_with_quality(file, JPEG_QUALITY)
                     .encode_image(picture.as_ref())
                     .map_err(io::Error::other)
