@@ -1,4 +1,4 @@
-//! What steers a long training: gradients of several batches, frozen parameters, states that are kept, an early end.
+//! Flags that steer a long training: gradients of several batches, frozen parameters, states that are kept, an early end.
 #![cfg(feature = "cli")]
 
 use std::path::{Path, PathBuf};

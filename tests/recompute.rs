@@ -14,7 +14,7 @@ fn batch() -> Batch {
     batch_of_step(&Street::render(&config, None), Augment::default(), 2, 0, 0).expect("a batch")
 }
 
-/// What a step takes from its tape.
+/// Results of a step's backward pass.
 struct Taken {
     /// By every parameter.
     gradients: Vec<Option<Tensor<f64>>>,

@@ -206,7 +206,7 @@ impl Args {
         Evaluation { protocol: self.protocol, scale: self.scale, flip: self.flip }
     }
 
-    /// What predicts: another program's file, or these weights.
+    /// The source of predictions: another program's file, or these weights.
     fn candidate(&self, weights: &super::weights::WeightsArgs) -> Result<Candidate> {
         if let Some(path) = &self.disparities {
             let found = Predictions::read(path)?;
@@ -230,7 +230,7 @@ impl Args {
 }
 
 impl Candidate {
-    /// What predicts the frames of some data, and the rows and columns of its maps (of a folder, its first one's).
+    /// The predictor for the frames of some data, and the rows and columns of its maps (of a folder, its first one's).
     fn predicts<'a>(&'a self, args: &Args, data: &dyn DataSource) -> Result<(Box<dyn Predicts + 'a>, (usize, usize))> {
         let size = (self.height, self.width);
         match &self.by {

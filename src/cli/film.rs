@@ -18,7 +18,7 @@ impl FilmArgs {
         self.fps.unwrap_or(FPS)
     }
 
-    /// What is read in the place of these paths: of a film the folder of its frames, which are taken out first.
+    /// Paths to read: a film is replaced by the folder of its frames, which are taken out first.
     pub fn folders(&self, paths: &[PathBuf]) -> Result<Vec<PathBuf>> {
         if self.fps.is_some() && !paths.iter().any(|path| is_film(path)) {
             return Err(Error::setting("--fps", "is for films, and none is given"));

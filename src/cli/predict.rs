@@ -329,7 +329,7 @@ impl Args {
         Intrinsics { fx: fx / width, fy: fy / height, cx: cx / width, cy: cy / height }
     }
 
-    /// What all depths are multiplied by, where pictures have no factor of their own.
+    /// Factor on all depths, where pictures have no factor of their own.
     fn factor_of_all(&self) -> f64 {
         if self.stereo { STEREO_SCALE } else { self.scale.unwrap_or(1.0) }
     }

@@ -6,7 +6,7 @@ use parallax::train::RunConfig;
 /// Neighbours in time, a second camera, or both.
 #[derive(clap::Args)]
 pub struct StereoArgs {
-    /// What a frame is compared with: its neighbours in time (mono), the same instant as the other camera saw it (stereo),
+    /// Sources that a frame is compared with: its neighbours in time (mono), the same instant as the other camera saw it (stereo),
     /// or both [default: mono].
     #[arg(long, value_name = "WHICH")]
     sources: Option<Sources>,

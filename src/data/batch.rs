@@ -39,7 +39,7 @@ impl Default for Augment {
 /// How samples become batches.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Making {
-    /// What is done to samples.
+    /// Augmentation of samples.
     pub augment: Augment,
     /// The frames that targets are compared with.
     pub sources: Sources,

@@ -13,7 +13,7 @@ use crate::{Error, Result};
 
 /// Frames a second that are taken out for training: between frames of 30 a second a car hardly moves.
 pub const FPS: f64 = 10.0;
-/// What films end in.
+/// Endings of films.
 const ENDINGS: [&str; 8] = ["mp4", "mov", "m4v", "mkv", "webm", "avi", "mpg", "3gp"];
 /// The file in a folder of frames that says of which film they are.
 const ORIGIN: &str = ".film";
@@ -119,7 +119,7 @@ pub fn make_film(pictures: &[PathBuf], fps: f64, film: &Path) -> Result<()> {
     done
 }
 
-/// What a film is, so that frames can be told from those of another: its size and time, and the rate.
+/// Identity of a film, by which its frames are known: its size and time, and the rate.
 fn origin(film: &Path, fps: f64) -> Result<String> {
     let data = fs::metadata(film).map_err(|e| Error::io(film, e))?;
     let changed = data.modified().ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok()).unwrap_or_default();

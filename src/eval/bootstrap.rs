@@ -16,7 +16,7 @@ use crate::random::{Random, Stream};
 /// The share of replicates that lie within an interval.
 const COVERED: f64 = 0.95;
 
-/// What is drawn.
+/// The units that are drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Unit {
@@ -59,7 +59,7 @@ impl Bootstrap {
         Bootstrap { units, unit, replicates, seed }
     }
 
-    /// What is drawn.
+    /// The units that are drawn.
     pub fn unit(&self) -> Unit {
         self.unit
     }

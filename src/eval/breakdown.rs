@@ -22,7 +22,7 @@ const COLUMNS: [&str; 3] = ["left", "centre", "right"];
 /// Pixels that have something in common.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Group {
-    /// What they have in common.
+    /// The label that they have in common.
     pub name: String,
     /// How many there are.
     pub pixels: usize,

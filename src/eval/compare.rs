@@ -20,7 +20,7 @@ pub struct Pair {
     pub prediction: f64,
 }
 
-/// What is compared of an image.
+/// Pixels of an image that are compared.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Comparison {
     /// Height and width of the ground truth.
@@ -29,7 +29,7 @@ pub struct Comparison {
     pub pairs: Vec<Pair>,
     /// The factor that was found for this image; `None` if it was given, or without a pixel.
     pub ratio: Option<f64>,
-    /// What predicted depths were multiplied by.
+    /// Factor on predicted depths.
     pub factor: f64,
     /// The logarithm of RMSE log.
     pub logarithm: Logarithm,

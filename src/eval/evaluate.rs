@@ -69,7 +69,7 @@ impl Predicts for MeanMap {
     }
 }
 
-/// What became of a sample.
+/// Outcome for a sample.
 #[derive(Clone, Debug)]
 pub enum Outcome {
     /// It was compared.

@@ -15,7 +15,7 @@ use crate::error::{Error, Result};
 use crate::formats::depth_png::read_depth_png;
 use crate::formats::npy;
 
-/// What `.npy` files hold.
+/// Content of `.npy` files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Holds {
     /// Depth, up to a factor.
@@ -150,7 +150,7 @@ impl Predicts for PredictionFolder {
     }
 }
 
-/// What a frame's file may be called, without its ending.
+/// Names that a frame's file may have, without its ending.
 fn file_names(name: &str) -> Vec<String> {
     let words: Vec<&str> = name.split_whitespace().filter(|word| *word != ".").collect();
     if let [folder, frame, side @ ("l" | "r")] = words[..]

@@ -1,4 +1,4 @@
-//! What a predictor is worth that knows nothing but the mean depth map.
+//! The baseline that knows nothing but the mean depth map.
 
 use super::compare::check_map;
 use super::protocol::MIN_DEPTH;

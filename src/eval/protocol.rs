@@ -25,7 +25,7 @@ pub enum Protocol {
     Dense,
     /// 0.001 < depth < 80 m within Garg's crop; the ground truth is the LiDAR's x, as in the Eigen tables.
     Eigen,
-    /// The same pixels; the ground truth is camera z.
+    /// The pixels of `eigen`; the ground truth is camera z.
     EigenCameraZ,
     /// Every pixel of the improved ground truth.
     Improved,
@@ -38,7 +38,7 @@ pub enum Protocol {
     /// Every pixel of DrivingStereo's truth, the whole picture.
     #[serde(rename = "drivingstereo")]
     DrivingStereo,
-    /// The same within Garg's crop: papers do not say whether they crop.
+    /// DrivingStereo's truth within Garg's crop: papers do not say whether they crop.
     #[serde(rename = "drivingstereo-garg")]
     DrivingStereoGarg,
     /// Every pixel of KITTI 2015's truth, the whole picture.
@@ -89,7 +89,7 @@ pub enum Logarithm {
     Ten,
 }
 
-/// What a protocol does.
+/// Rules of a protocol.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rules {
     /// The name that it is chosen by.
@@ -158,7 +158,7 @@ impl Protocol {
         TABLE.iter().map(|(protocol, _)| *protocol)
     }
 
-    /// What this protocol does.
+    /// The rules of this protocol.
     pub fn rules(self) -> &'static Rules {
         let found = TABLE.iter().find(|(protocol, _)| *protocol == self);
         &found.expect("every protocol has its line in the table").1
@@ -218,9 +218,9 @@ impl Rules {
 /// Rows and columns of a ground truth.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Windows {
-    /// What the prediction is of.
+    /// The part that the prediction covers.
     pub shown: [Range<usize>; 2],
-    /// What counts.
+    /// The pixels that count.
     pub counted: [Range<usize>; 2],
 }
 

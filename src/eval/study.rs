@@ -9,7 +9,7 @@ use super::metrics::{Metrics, Report};
 use crate::Result;
 use crate::data::DataSource;
 
-/// What is asked of a study.
+/// Settings of a study.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
     /// Where bins of distance begin, in metres.
@@ -30,7 +30,7 @@ impl Default for Settings {
 /// Intervals, and what they were made of.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Interval {
-    /// What was drawn.
+    /// The units that were drawn.
     pub unit: Unit,
     /// How many there were to draw from.
     pub units: usize,

@@ -150,7 +150,7 @@ impl<'a> Elements<'a> {
     }
 }
 
-/// What stands before the numbers of an array.
+/// Header of an array, before its numbers.
 struct Head {
     class: u32,
     complex: bool,

@@ -154,7 +154,7 @@ struct TransformerPath {
     layers: Vec<Arc<TransformerLayer>>,
 }
 
-/// What the layers of a path know positions by: a depthwise convolution of the tokens, and that of their values.
+/// Position encodings that the layers of a path share: a depthwise convolution of the tokens, and that of their values.
 #[derive(Debug)]
 struct Encodings {
     position: DepthwiseConv,

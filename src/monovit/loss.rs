@@ -110,7 +110,7 @@ pub struct Views<T: Float> {
 }
 
 impl<T: Float> Views<T> {
-    /// The same targets with some of the sources.
+    /// These targets with some of the sources.
     ///
     /// # Panics
     /// If there are not so many.

@@ -15,7 +15,7 @@ const BOTTOM: f64 = 60.0;
 /// A line of a plot.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Line {
-    /// What it is called in the legend.
+    /// Name in the legend.
     pub name: String,
     /// Its points, x and y; what is not finite interrupts it.
     pub points: Vec<[f64; 2]>,

@@ -57,7 +57,7 @@ struct Sequence {
     world: World,
     poses: Vec<Pose>,
     images: Vec<Arc<RgbImage>>,
-    /// What a second camera saw; empty without one.
+    /// Frames of the second camera; empty without one.
     right: Vec<Arc<RgbImage>>,
 }
 

@@ -9,7 +9,7 @@ use crate::nn::Params;
 /// For each parameter and running statistic, in the order of [`Params`], whether it is left alone.
 pub type Frozen = Arc<[bool]>;
 
-/// What patterns such as `encoder.*` name; `*` stands for any characters, dots too. A pattern has to match a whole name.
+/// Parameters and statistics that patterns such as `encoder.*` name; `*` stands for any characters, dots too. A pattern has to match a whole name.
 ///
 /// # Errors
 /// If a pattern matches nothing: what there is. If nothing is left to learn.

@@ -32,15 +32,15 @@ impl Limit {
 pub struct Check {
     /// The name, which stays the same.
     pub name: &'static str,
-    /// What is compared with the limit, in words.
+    /// The figure that is compared with the limit, in words.
     pub figure: &'static str,
     /// The threshold.
     pub limit: Limit,
     /// The lines of the log that are looked at together; with fewer there is no warning.
     pub lines: usize,
-    /// What the warning says about the training.
+    /// Meaning of the warning for the training.
     pub meaning: &'static str,
-    /// What to do about it.
+    /// Advice.
     pub advice: &'static str,
     /// The figure; nothing where the question does not arise.
     measure: fn(&Window) -> Option<f64>,

@@ -8,7 +8,7 @@ use crate::error::{Error, Result};
 use crate::formats::bounded::{MAX_SETTINGS, read_text};
 use crate::monovit::Preset;
 
-/// What a recipe and a file say, still without the defaults.
+/// Settings of a recipe and a file, still without the defaults.
 #[derive(Debug, Default)]
 pub struct Layers {
     said: toml::Table,

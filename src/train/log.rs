@@ -61,7 +61,7 @@ pub(super) fn forget_after(folder: &Path, steps: u64, validated: u64) -> Result<
     Ok(())
 }
 
-/// What a run's log says of its steps, oldest first. Lines from before they had all of today's figures are left out.
+/// Steps of a run's log, oldest first. Lines from before they had all of today's figures are left out.
 pub(super) fn steps(folder: &Path) -> Result<Vec<StepReport>> {
     let path = folder.join(LOG);
     if !path.exists() {

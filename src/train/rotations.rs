@@ -75,7 +75,7 @@ impl RotationPlan {
         self.pixels * (1.0 - 0.75 * step as f64 / self.steps as f64)
     }
 
-    /// What a step (from 0) of the training itself adds to its loss, if anything; `pass` (from 0) counts the batches.
+    /// Term that a step (from 0) of the training itself adds to its loss, if any; `pass` (from 0) counts the batches.
     pub(super) fn term(
         &self,
         [step, pass]: [u64; 2],

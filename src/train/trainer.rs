@@ -43,7 +43,7 @@ pub struct StepReport {
     /// The norms of the gradients of the encoder, the decoder and the pose networks, before clipping.
     #[serde(default)]
     pub grad_norms: [f64; 3],
-    /// What the networks predict, in figures.
+    /// Figures of the networks' predictions.
     #[serde(default, flatten)]
     pub vitals: Vitals,
 }
@@ -87,7 +87,7 @@ pub struct Trainer {
     frozen: Frozen,
 }
 
-/// What one batch gives to a step.
+/// Contribution of one batch to a step.
 struct Pass {
     gradients: Vec<Option<Tensor<f32>>>,
     /// Running statistics that it moved.
@@ -96,7 +96,7 @@ struct Pass {
     report: StepReport,
 }
 
-/// What a forward pass leaves behind.
+/// Results of a forward pass.
 struct Forward {
     c: Context<f32>,
     found: Loss<f32>,
@@ -131,7 +131,7 @@ fn views(batch: &Batch, scales: Scales) -> Views<f32> {
     }
 }
 
-/// What maps points of the targets' cameras to those of their sources, `[B, 3, 4]` each: what the pose network sees in
+/// Transforms of points from the targets' cameras to those of their sources, `[B, 3, 4]` each: what the pose network sees in
 /// neighbours, what is known of a second camera.
 fn transforms(model: &MonoVit, c: &Context<f32>, batch: &Batch, target: &Var<f32>) -> Vec<Var<f32>> {
     let in_time = batch.neighbours.as_ref().map(|neighbours| {
@@ -179,7 +179,7 @@ impl Trainer {
         self.params.iter().enumerate().any(learns)
     }
 
-    /// What stays as it is in a step (from 0).
+    /// Parameters and statistics that stay as they are in a step (from 0).
     fn frozen_at(&self, step: u64) -> Frozen {
         if step >= self.plan.pose_first {
             return self.frozen.clone();

@@ -1,4 +1,4 @@
-//! What a training step shows of its own health: the disparity, the motion, where warped samples fall, gradients by part.
+//! Figures of a training step's health: the disparity, the motion, where warped samples fall, gradients by part.
 //!
 //! Everything is computed from values that the step has anyway; pixels are looked at every fourth row and column.
 
@@ -31,7 +31,7 @@ pub struct Vitals {
     pub inside: f64,
 }
 
-/// What [`Vitals`] are computed from.
+/// Inputs of [`Vitals`].
 pub struct Signs<'a> {
     /// The disparity at full size, `[B, H, W, 1]`.
     pub disparity: &'a Tensor<f32>,

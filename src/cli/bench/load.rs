@@ -35,7 +35,7 @@ pub struct Args {
     rounds: usize,
 }
 
-/// What was measured, means over all rounds.
+/// Measurements, means over all rounds.
 #[derive(Serialize)]
 struct Speeds {
     /// Steps a second with batches that were made before.

@@ -46,17 +46,17 @@ struct Report {
     found: Option<Findings>,
     /// The folders that hold pictures.
     folders: Vec<Folder>,
-    /// What the frames say about each camera.
+    /// The verdict of the frames on each camera.
     camera_fit: Vec<CameraFit>,
     /// Time and memory of a training step; nothing where none can be taken.
     step: Option<Step>,
     /// Why one cannot train on this as it is; empty if one can.
     faults: Vec<String>,
-    /// What should be looked at.
+    /// Advice: things to look at.
     advice: Vec<String>,
 }
 
-/// What a training step takes on this machine.
+/// Time and memory of a training step on this machine.
 #[derive(Serialize)]
 struct Step {
     seconds: f64,

@@ -1,4 +1,4 @@
-//! What `parallax eval` says: what was measured, how, and what came out.
+//! The output of `parallax eval`: data, protocol, results.
 
 use std::path::PathBuf;
 
@@ -15,7 +15,7 @@ use serde::Serialize;
 use super::Args;
 use crate::cli::sizes::Numbers;
 
-/// What was measured, and what came out.
+/// A measurement: its data, its settings, its results.
 #[derive(Serialize)]
 pub struct Measured {
     weights: Option<String>,
@@ -34,7 +34,7 @@ pub struct Measured {
     others: Vec<One>,
 }
 
-/// What predicted, and how well.
+/// A predictor and its results.
 pub struct One {
     pub name: String,
     pub height: usize,
@@ -110,7 +110,7 @@ fn columns(logarithm: Logarithm) -> [&'static str; 7] {
 }
 
 impl Measured {
-    /// What was measured, as it was asked for; of several, the first is what the others are compared with.
+    /// The predictor, as it was asked for; of several, the first is what the others are compared with.
     pub fn new(args: &Args, mut found: Vec<One>, left_out: &LeftOut) -> Measured {
         let first = found.remove(0);
         let of_weights = args.disparities.is_none() && args.predictions.is_none();
@@ -244,7 +244,7 @@ impl Measured {
     }
 }
 
-/// What intervals were made of.
+/// The units that intervals were resampled from.
 fn said(interval: &Interval) -> String {
     use parallax::eval::bootstrap::Unit;
     let what = match interval.unit {

@@ -1,4 +1,4 @@
-//! What `parallax eval` measures on.
+//! The data that `parallax eval` measures on.
 
 use std::path::Path;
 
@@ -15,7 +15,7 @@ use parallax::street::{Street, StreetConfig};
 
 use super::Args;
 
-/// What is measured on, at the networks' size, and which of its frames cannot be.
+/// The data to measure on, at the networks' size, and the frames that cannot be measured.
 pub fn open(args: &Args, height: usize, width: usize) -> Result<(Box<dyn DataSource>, LeftOut)> {
     if args.data == "street" {
         let street = StreetConfig { height, width, sequences: 8, seed: args.seed, ..StreetConfig::default() };

@@ -52,7 +52,7 @@ const CENTRE_TURN: f64 = 0.25;
 /// fit.
 const FOCAL_FINE: [f64; 2] = [0.88, 1.14];
 const FOCAL_KNOWN: [f64; 2] = [0.77, 1.3];
-/// The same for the principal point, in shares of the width: across and down, and across.
+/// Trial offsets of the principal point, in shares of the width: across and down, and across.
 const CENTRE_FINE: [f64; 2] = [0.04, 0.08];
 const CENTRE_KNOWN: f64 = 0.1;
 /// A direction of travel that is further from the camera's axis is worth a word, in degrees.
@@ -71,7 +71,7 @@ pub enum Verdict {
     CannotTell,
 }
 
-/// What the frames say about a camera.
+/// The verdict of the frames on a camera.
 #[derive(Clone, Debug, Serialize)]
 pub struct CameraFit {
     /// The name of the first sample that was taken with it.
@@ -106,7 +106,7 @@ pub fn size(widest: Option<u32>, [height, width]: [usize; 2]) -> [usize; 2] {
     if wide <= width { [height, width] } else { [(height * wide).div_ceil(width), wide] }
 }
 
-/// What the frames say about each camera of a data set. Frames that cannot be read are passed over
+/// The verdict of the frames on each camera of a data set. Frames that cannot be read are passed over
 /// ([`check`](super::check::check) names them).
 pub fn fit(data: &dyn DataSource) -> Vec<CameraFit> {
     let mut cameras: Vec<(Intrinsics, Vec<usize>)> = Vec::new();
@@ -120,7 +120,7 @@ pub fn fit(data: &dyn DataSource) -> Vec<CameraFit> {
     cameras.into_iter().map(|(camera, samples)| fit_one(data, camera, &samples)).collect()
 }
 
-/// What some samples say about their camera.
+/// The verdict of some samples on their camera.
 fn fit_one(data: &dyn DataSource, intrinsics: Intrinsics, samples: &[usize]) -> CameraFit {
     let mut fit = CameraFit {
         first: samples.first().map_or_else(String::new, |&sample| data.name(sample)),

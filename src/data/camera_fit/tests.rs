@@ -25,7 +25,7 @@ impl DataSource for Claimed<'_> {
     }
 }
 
-/// What is said of a street's camera with other focal lengths (a factor) and another principal point (shares of the size).
+/// The verdict on a street's camera with other focal lengths (a factor) and another principal point (shares of the size).
 fn claimed(street: &Street, factor: f64, moved: [f64; 2]) -> CameraFit {
     let k = street.config().intrinsics;
     let k = Intrinsics { fx: k.fx * factor, fy: k.fy * factor, cx: k.cx + moved[0], cy: k.cy + moved[1] };

@@ -61,7 +61,7 @@ pub struct Findings {
 }
 
 impl Findings {
-    /// What makes it impossible to train on the data as they are, one sentence for each fault; empty if there is none.
+    /// Faults that make training on the data impossible, one sentence for each fault; empty if there is none.
     pub fn faults(&self) -> Vec<String> {
         let mut faults = Vec::new();
         if let Some((name, why)) = self.unreadable.first() {
@@ -76,7 +76,7 @@ impl Findings {
         faults
     }
 
-    /// What should be looked at, one sentence for each; empty if there is nothing.
+    /// Advice on things to look at, one sentence for each; empty if there is nothing.
     pub fn advice(&self) -> Vec<String> {
         let mut advice = Vec::new();
         for recording in &self.recordings {

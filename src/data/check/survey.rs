@@ -44,7 +44,7 @@ pub struct Folder {
     pub time_gaps: Vec<[String; 2]>,
     /// The usual time from frame to frame, in seconds, where one of these files is there.
     pub seconds: Option<f64>,
-    /// What is wrong with that file.
+    /// The file's fault.
     pub times_fault: Option<String>,
 }
 
@@ -142,7 +142,7 @@ fn gaps(values: &[f64]) -> Vec<usize> {
 }
 
 impl Folder {
-    /// What makes it impossible to train on the folder as it is, in words.
+    /// Faults that make training on the folder impossible, in words.
     pub fn faults(&self) -> Vec<String> {
         let mut faults = Vec::new();
         if let Some((name, why)) = self.unreadable.first() {
@@ -166,7 +166,7 @@ impl Folder {
         faults
     }
 
-    /// What should be looked at, in words.
+    /// Advice on things to look at, in words.
     pub fn advice(&self) -> Vec<String> {
         let mut advice = Vec::new();
         if let Some([before, after]) = self.missing.first() {

@@ -127,7 +127,7 @@ impl Calibration {
     }
 }
 
-/// What a calibration file says of two rectified cameras side by side.
+/// Two rectified cameras side by side, from a calibration file.
 #[derive(Clone, Debug, PartialEq)]
 pub(in crate::data) struct StereoPair {
     left: Projection,

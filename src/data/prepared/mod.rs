@@ -107,7 +107,7 @@ impl Prepared {
     }
 }
 
-/// What has changed between two lists of frames, if anything has.
+/// The first difference between two lists of frames, if there is one.
 fn change(then: &[Source], now: &[Source]) -> Option<String> {
     if then == now {
         return None;

@@ -17,7 +17,7 @@ use crate::data::cache::{read_resized, side};
 use crate::formats::atomic::appear;
 use crate::{Error, Result};
 
-/// What a preparation came to.
+/// Result of a preparation.
 #[derive(Clone, Debug)]
 pub struct Outcome {
     /// The file.

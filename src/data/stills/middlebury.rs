@@ -57,7 +57,7 @@ pub(super) fn add(stills: &mut Stills, root: &Path, camera: Camera) -> Result<()
     Ok(())
 }
 
-/// What `calib.txt` says.
+/// The entries of `calib.txt`.
 struct Calib {
     /// In pixels.
     focal: f64,
