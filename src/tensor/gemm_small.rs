@@ -1,4 +1,4 @@
-//! matrixmultiply's product: an independent second opinion on faer's, and the one place with `unsafe` code.
+//! matrixmultiply's product: an independent second opinion on faer's. It and `bf16` are the two files with `unsafe` code.
 #![allow(unsafe_code)]
 
 /// `a [m, k] * b [k, n]`, row-major, in f32.
