@@ -42,14 +42,14 @@ pub struct Args {
     #[arg(long, value_name = "FILE", conflicts_with_all = ["weights", "allow_partial", "height", "width", "flip"])]
     disparities: Option<PathBuf>,
     /// Measure what another program predicted: a folder of depth maps, matched with the frames by their names:
-    /// 16-bit PNGs of metres times 256, or .npy `[height, width]`; `_depth` may stand before the ending.
+    /// 16-bit PNGs of metres times 256, .npy `[height, width]` or .pfm; `_depth` may stand before the ending.
     ///
     /// KITTI raw: FOLDER/image_02/data/0000000005.png, or without data/; other folders: as the frames. What `predict`
     /// writes for the same folder fits.
     #[arg(long, value_name = "DIR")]
     #[arg(conflicts_with_all = ["weights", "disparities", "allow_partial", "height", "width", "flip"])]
     predictions: Option<PathBuf>,
-    /// The .npy files of --predictions hold inverse depth, as `predict --npy` writes it [default: depth].
+    /// The .npy and .pfm files of --predictions hold inverse depth, as `predict --npy` writes it [default: depth].
     #[arg(long, requires = "predictions")]
     inverse: bool,
     /// Pass over files of --predictions that are of no frame that is measured [default: they are an error].
@@ -68,7 +68,7 @@ pub struct Args {
     trajectory: Option<PathBuf>,
     /// Frames to measure on: `street` (with a seed that no run trains on) or a folder: in
     /// the layout of KITTI raw, or (where the protocol is not KITTI's) of frames with depth maps, as train takes them, or
-    /// in the layout of KITTI 2015, Make3D, DrivingStereo's weather sets or Middlebury 2014.
+    /// in the layout of Cityscapes' video, KITTI 2015, Make3D, DrivingStereo's weather sets or Middlebury 2014.
     #[arg(long, value_name = "street|DIR", default_value = "street")]
     data: String,
     /// List of a folder's frames, lines `FOLDER FRAME SIDE` [default: all].

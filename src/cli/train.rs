@@ -28,9 +28,10 @@ use super::stereo::StereoArgs;
 pub struct Args {
     /// Training frames: `street` (rendered by the program), a folder or a film [default: street].
     ///
-    /// A folder in the layout of KITTI raw; or any folder of PNG, JPEG or WebP frames, in the order in which people number
-    /// them, each folder inside it a sequence of its own. `camera.toml` among the frames says which camera took them.
-    /// Depth maps, if there are any, lie in a folder `depth` beside the frames, under their names.
+    /// A folder in the layout of KITTI raw, of KITTI odometry or of Cityscapes' video; or any folder of PNG, JPEG or WebP
+    /// frames, in the order in which people number them, each folder inside it a sequence of its own. `camera.toml` among
+    /// the frames says which camera took them. Depth maps and the right camera's pictures, if there are any, lie in folders
+    /// `depth` and `right` beside the frames, under their names, or where `camera.toml` says.
     ///
     /// A film (mp4, mov, mkv, ...) is read by ffmpeg, which has to be installed: --fps frames a second are taken out into a
     /// folder beside it, which is what the run then trains on.
@@ -38,7 +39,7 @@ pub struct Args {
     data: Option<String>,
     #[command(flatten)]
     film: FilmArgs,
-    /// List of a folder's frames to train on, lines `FOLDER FRAME`, or of KITTI raw `FOLDER FRAME SIDE`
+    /// List of a folder's frames to train on, lines `FOLDER FRAME`, or of KITTI and Cityscapes `FOLDER FRAME SIDE`
     /// [default: all that have both neighbours].
     #[arg(long, value_name = "FILE")]
     split: Option<PathBuf>,

@@ -5,8 +5,9 @@ use std::hash::Hash;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use image::RgbImage;
+use image::{RgbImage, imageops};
 
+use super::frames::used;
 use super::prepared::Prepared;
 use super::resize::lanczos;
 use crate::formats::picture::read_picture;
@@ -16,6 +17,8 @@ use crate::{Error, Result};
 pub(super) struct Pictures<K> {
     width: u32,
     height: u32,
+    /// The share of a picture's rows that is used, from the top.
+    used_rows: f64,
     most_bytes: usize,
     kept: Mutex<Kept<K>>,
     /// Frames that were prepared at this size.
@@ -34,7 +37,13 @@ impl<K: Eq + Hash> Pictures<K> {
     /// If a side is 0 or longer than 16384.
     pub(super) fn new(height: usize, width: usize, most_bytes: usize) -> Result<Self> {
         let kept = Mutex::new(Kept { pictures: HashMap::new(), bytes: 0 });
-        Ok(Pictures { width: side("width", width)?, height: side("height", height)?, most_bytes, kept, prepared: None })
+        let [height, width] = [side("height", height)?, side("width", width)?];
+        Ok(Pictures { width, height, used_rows: 1.0, most_bytes, kept, prepared: None })
+    }
+
+    /// Uses a share of the pictures' rows, from the top.
+    pub(super) fn with_rows(self, used_rows: f64) -> Self {
+        Pictures { used_rows, ..self }
     }
 
     /// Takes frames from the file of prepared ones in the folder of the data, if there is one of this size.
@@ -64,7 +73,7 @@ impl<K: Eq + Hash> Pictures<K> {
         let prepared = self.prepared.as_ref().map(|prepared| prepared.get(&path)).transpose()?.flatten();
         let picture = Arc::new(match prepared {
             Some(picture) => picture,
-            None => read_resized(&path, self.width, self.height)?,
+            None => read_resized(&path, self.used_rows, self.width, self.height)?,
         });
         let bytes = picture.as_raw().len();
         let mut kept = self.kept();
@@ -89,12 +98,16 @@ impl<K: Eq + Hash> Pictures<K> {
     }
 }
 
-/// A picture at `width x height` pixels.
+/// A share of a picture's rows, from the top, at `width x height` pixels.
 ///
 /// # Errors
 /// If it cannot be read.
-pub(super) fn read_resized(path: &Path, width: u32, height: u32) -> Result<RgbImage> {
-    let picture = read_picture(path)?;
+pub(super) fn read_resized(path: &Path, used_rows: f64, width: u32, height: u32) -> Result<RgbImage> {
+    let mut picture = read_picture(path)?;
+    let rows = used(picture.height() as usize, used_rows) as u32;
+    if rows < picture.height() {
+        picture = imageops::crop_imm(&picture, 0, 0, picture.width(), rows).to_image();
+    }
     Ok(if picture.dimensions() == (width, height) { picture } else { lanczos(&picture, width, height) })
 }
 

@@ -1,9 +1,10 @@
 //! Which camera took the pictures: what the user says, a `camera.toml` among the data, the calibration, or KITTI's constants.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use super::augment::flip_intrinsics;
 use crate::camera::Intrinsics;
 use crate::formats::bounded::{MAX_SETTINGS, read_text};
 use crate::formats::picture::is_size;
@@ -72,16 +73,23 @@ pub(super) fn in_words<'a>(cameras: impl Iterator<Item = &'a Found>) -> Vec<Stri
     said
 }
 
+/// The camera of a sample's pictures once they are mirrored and `width` pixels wide. The published constants stay as they
+/// are, as in the published training.
+pub(super) fn mirrored(camera: &Found, width: usize) -> Intrinsics {
+    if camera.published { camera.intrinsics } else { flip_intrinsics(camera.intrinsics, width) }
+}
+
 /// Width over height of KITTI's pictures.
 const KITTI_ASPECT: f64 = 1242.0 / 375.0;
 
 /// The name of the file that says which camera took the pictures beside it.
 const FILE: &str = "camera.toml";
 
-/// The content of `camera.toml`: a field of view, or focal lengths and principal point in pixels of a size.
-#[derive(Deserialize)]
+/// The content of `camera.toml`: a field of view, or focal lengths and principal point in pixels of a size; and where the
+/// files of frames lie ([`frames`](super::frames)).
+#[derive(Default, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct CameraFile {
+pub(super) struct CameraFile {
     width: Option<f64>,
     height: Option<f64>,
     fx: Option<f64>,
@@ -89,6 +97,26 @@ struct CameraFile {
     cx: Option<f64>,
     cy: Option<f64>,
     fov: Option<f64>,
+    /// Pattern of the pictures that are frames.
+    pub(super) frames: Option<String>,
+    /// Pattern of the right camera's pictures.
+    pub(super) right: Option<String>,
+    /// Pattern of depth maps.
+    pub(super) depth: Option<String>,
+    /// Metres between the cameras.
+    pub(super) baseline: Option<f64>,
+}
+
+/// The `camera.toml` in a folder or the nearest one above it up to `root`, if there is one.
+///
+/// # Errors
+/// If it cannot be read.
+pub(super) fn file_of(root: &Path, folder: &Path) -> Result<Option<(PathBuf, CameraFile)>> {
+    let above = folder.ancestors().take_while(|folder| folder.starts_with(root));
+    let Some(path) = above.map(|folder| folder.join(FILE)).find(|file| file.is_file()) else { return Ok(None) };
+    let text = read_text(&path, MAX_SETTINGS, "a camera")?;
+    let said = toml::from_str(&text).map_err(|e| Error::file(&path, e.to_string()))?;
+    Ok(Some((path, said)))
 }
 
 impl Camera {
@@ -123,9 +151,9 @@ impl Camera {
                 Ok(Found::measured(found, "the intrinsics that were given"))
             }
             Camera::Auto => {
-                let above = drive.ancestors().take_while(|folder| folder.starts_with(root));
-                if let Some(file) = above.map(|folder| folder.join(FILE)).find(|file| file.is_file()) {
-                    return Ok(Found::measured(read(&file, size)?, file.display().to_string()));
+                if let Some((file, said)) = file_of(root, drive)? {
+                    let found = said.intrinsics(size).map_err(|why| Error::file(&file, why))?;
+                    return Ok(Found::measured(found, file.display().to_string()));
                 }
                 if let Some(calibrated) = calibration {
                     return calibrated();
@@ -144,32 +172,32 @@ impl Camera {
     }
 }
 
-/// Reads `camera.toml`, for pictures of a size.
-fn read(path: &Path, size: [f64; 2]) -> Result<Intrinsics> {
-    let text = read_text(path, MAX_SETTINGS, "a camera")?;
-    let said: CameraFile = toml::from_str(&text).map_err(|e| Error::file(path, e.to_string()))?;
-    let found = match said {
-        CameraFile { fov: Some(fov), fx: None, fy: None, cx: None, cy: None, .. } => of_fov(fov, size),
-        CameraFile {
-            width: Some(w),
-            height: Some(h),
-            fx: Some(fx),
-            fy: Some(fy),
-            cx: Some(cx),
-            cy: Some(cy),
-            fov: None,
-        } => {
-            if !is_size(w, h) {
-                Err(format!("is for pictures of {w}x{h}: expected whole pixels, at most 100 megapixels"))
-            } else if ((w / h) / (size[0] / size[1]) - 1.0).abs() > 0.02 {
-                Err(format!("is for pictures of {w}x{h}, but these have {}x{}: another aspect", size[0], size[1]))
-            } else {
-                of_pixels([fx, fy, cx, cy], [w, h])
+impl CameraFile {
+    /// Intrinsics of pictures of a size, `[width, height]`; why they cannot be, if they cannot.
+    fn intrinsics(&self, size: [f64; 2]) -> Result<Intrinsics, String> {
+        match *self {
+            CameraFile { fov: Some(fov), fx: None, fy: None, cx: None, cy: None, .. } => of_fov(fov, size),
+            CameraFile {
+                width: Some(w),
+                height: Some(h),
+                fx: Some(fx),
+                fy: Some(fy),
+                cx: Some(cx),
+                cy: Some(cy),
+                fov: None,
+                ..
+            } => {
+                if !is_size(w, h) {
+                    Err(format!("is for pictures of {w}x{h}: expected whole pixels, at most 100 megapixels"))
+                } else if ((w / h) / (size[0] / size[1]) - 1.0).abs() > 0.02 {
+                    Err(format!("is for pictures of {w}x{h}, but these have {}x{}: another aspect", size[0], size[1]))
+                } else {
+                    of_pixels([fx, fy, cx, cy], [w, h])
+                }
             }
+            _ => Err("expected width, height, fx, fy, cx and cy in pixels, or fov in degrees across".into()),
         }
-        _ => Err("expected width, height, fx, fy, cx and cy in pixels, or fov in degrees across".into()),
-    };
-    found.map_err(|why| Error::file(path, why))
+    }
 }
 
 /// Square pixels, the principal point between the middle ones.
@@ -243,7 +271,7 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join(FILE);
         File::create(&path).unwrap().set_len(1 << 40).unwrap();
-        let error = read(&path, [800.0, 600.0]).unwrap_err().to_string();
+        let error = file_of(place.path(), place.path()).map(|_| ()).unwrap_err().to_string();
         assert!(error.contains(FILE) && error.contains("a camera of more than 1048576"), "{error}");
     }
 

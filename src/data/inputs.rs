@@ -176,7 +176,7 @@ fn order_of_pieces(a: &[u8], b: &[u8]) -> Ordering {
     a.len().cmp(&b.len()).then_with(|| a.cmp(b))
 }
 
-fn natural_order_of_paths(a: &Path, b: &Path) -> Ordering {
+pub(super) fn natural_order_of_paths(a: &Path, b: &Path) -> Ordering {
     let names = |path: &Path| path.iter().map(|n| n.to_string_lossy().into_owned()).collect::<Vec<_>>();
     let (a, b) = (names(a), names(b));
     let differing = a.iter().zip(&b).map(|(a, b)| natural_order(a, b)).find(|o| o.is_ne());

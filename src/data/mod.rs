@@ -1,4 +1,4 @@
-//! Where frames come from: the embedded street, KITTI raw, any folder, single pictures with ground truth; and what is done to them before training.
+//! Where frames come from: the embedded street, KITTI raw, recordings in folders, single pictures with ground truth; and what is done to them before training.
 
 pub mod apart;
 pub mod aside;
@@ -19,6 +19,7 @@ pub mod resize;
 pub mod stereo;
 pub mod stills;
 mod street;
+mod truth;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -141,7 +142,8 @@ impl Opening<'_> {
     }
 }
 
-/// Opens a folder to train on: KITTI raw by its layout ([`kitti`]), or any folder of frames ([`frames`]).
+/// Opens a folder to train on: KITTI raw by its layout ([`kitti`]), or recordings in another one, any folder of frames among
+/// them ([`frames`]).
 ///
 /// # Errors
 /// If the folder holds single pictures ([`stills`]), as [`Kitti::open`](kitti::Kitti::open) and [`Frames::open`](frames::Frames::open), and if prepared frames do not belong to the
@@ -174,12 +176,9 @@ pub fn open_folder(root: &Path, opening: Opening) -> Result<Arc<dyn DataSource>>
         );
         return Err(Error::file(root, message));
     }
-    if sources.other_camera() {
-        let message = "a folder of frames has one camera: train with --sources mono, or on KITTI raw, whose image_02 and \
-                       image_03 are a pair";
-        return Err(Error::setting("sources", message));
-    }
-    let options = frames::Options { camera, skip_bad_frames, cache_bytes, ..frames::Options::default() };
+    let (neighbours, stereo) = (sources.in_time(), sources.other_camera());
+    let usual = frames::Options::default();
+    let options = frames::Options { camera, skip_bad_frames, neighbours, stereo, cache_bytes, ..usual };
     let mut frames = frames::Frames::open(root, list, size, options)?;
     if let Some(file) = prepared {
         frames.pictures_mut().take_from(file, root)?;

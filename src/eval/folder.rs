@@ -2,8 +2,9 @@
 //!
 //! A frame `FOLDER FRAME SIDE` of KITTI raw is looked for as `FOLDER/image_02/data/0000000005` (`image_03` for the right
 //! side), as `FOLDER/image_02/0000000005`; any other frame, such as `drive_b 0001` of a folder of frames, as its words with
-//! `/` between them. Files end in `.png` (16-bit grey, metres times 256) or `.npy` (floats `[height, width]`); `_depth` may
-//! stand in front of the ending, and the pictures `NAME_disp.png` that `predict` writes beside its depth are passed over.
+//! `/` between them. One of Cityscapes, `train/aachen/aachen_000000 5 l`, may also be `train/aachen/aachen_000000_000005_leftImg8bit`.
+//! Files end in `.png` (16-bit grey, metres times 256), `.npy` (floats `[height, width]`) or `.pfm`; `_depth` may stand in front
+//! of the ending, and the pictures `NAME_disp.png` that `predict` writes beside its depth are passed over.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -14,8 +15,9 @@ use crate::data::DataSource;
 use crate::error::{Error, Result};
 use crate::formats::depth_png::read_depth_png;
 use crate::formats::npy;
+use crate::formats::pfm::read_pfm;
 
-/// Content of `.npy` files.
+/// Content of `.npy` and `.pfm` files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Holds {
     /// Depth, up to a factor.
@@ -56,7 +58,7 @@ impl PredictionFolder {
         }
         if let Some((name, names)) = missing.first() {
             let message = format!(
-                "{} of {} frames have no prediction; the first: {name}, looked for as {}.png or .npy",
+                "{} of {} frames have no prediction; the first: {name}, looked for as {}.png, .npy or .pfm",
                 missing.len(),
                 data.len(),
                 names.join(" or ")
@@ -83,10 +85,13 @@ impl PredictionFolder {
 
     /// Inverse depth from a file, and its rows and columns.
     fn read(&self, file: &Path) -> Result<(Vec<f32>, (usize, usize))> {
-        let is_png = file.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("png"));
-        let (values, size, holds) = if is_png {
+        let is = |known: &str| file.extension().is_some_and(|ending| ending.eq_ignore_ascii_case(known));
+        let (values, size, holds) = if is("png") {
             let map = read_depth_png(file)?;
             (map.metres, (map.height, map.width), Holds::Depth)
+        } else if is("pfm") {
+            let map = read_pfm(file)?;
+            (map.values, (map.height, map.width), self.holds)
         } else {
             let (values, size) = read_npy(file)?;
             (values, size, self.holds)
@@ -157,7 +162,11 @@ fn file_names(name: &str) -> Vec<String> {
         && let Ok(number) = frame.parse::<u32>()
     {
         let camera = if side == "l" { "image_02" } else { "image_03" };
-        return ["/data/", "/"].map(|between| format!("{folder}/{camera}{between}{number:010}")).to_vec();
+        let mut names = ["/data/", "/"].map(|between| format!("{folder}/{camera}{between}{number:010}")).to_vec();
+        // Cityscapes.
+        let side = if side == "l" { "left" } else { "right" };
+        names.push(format!("{folder}_{number:06}_{side}Img8bit"));
+        return names;
     }
     vec![words.join("/")]
 }
@@ -177,7 +186,7 @@ fn walk(root: &Path, inside: &Path, found: &mut BTreeMap<String, PathBuf>) -> Re
             continue;
         }
         let Some((stem, ending)) = name.rsplit_once('.') else { continue };
-        if !["png", "npy"].iter().any(|known| ending.eq_ignore_ascii_case(known)) || stem.ends_with("_disp") {
+        if !["png", "npy", "pfm"].iter().any(|known| ending.eq_ignore_ascii_case(known)) || stem.ends_with("_disp") {
             continue;
         }
         let stem = stem.strip_suffix("_depth").unwrap_or(stem);
@@ -235,7 +244,9 @@ mod tests {
         png(at("day/drive/image_03/0000000007.png"), 8.0);
         png(at("day/drive/image_02/data/0000000005_disp.png"), 1.0);
         write_npy_shaped(at("b/0001.npy"), &[0.5; 8], &[2, 4]).unwrap();
-        write_npy_shaped(at("0002.npy"), &[0.25; 8], &[2, 4]).unwrap();
+        let mut map = b"Pf\n4 2\n-1.0\n".to_vec();
+        map.extend([0.25f32; 8].iter().flat_map(|value| value.to_le_bytes()));
+        fs::write(at("0002.pfm"), map).unwrap();
         let data = Named(vec!["b 0001", "day/drive 5 l", ". 0002", "day/drive 7 r"]);
         for (holds, expected) in
             [(Holds::Depth, [2.0, 0.25, 4.0, 0.125]), (Holds::InverseDepth, [0.5, 0.25, 0.25, 0.125])]

@@ -83,6 +83,29 @@ pub(crate) fn drive(draw: &mut Draw, frames: usize, lane: f64, room: f64, keep_r
     poses
 }
 
+/// A path that winds: `rate` degrees a frame to one side, then to the other, at `speed` metres a frame along x = `lane`. The
+/// camera hangs 1.6 m ahead of the rear axle, which is what follows its own direction.
+pub(crate) fn winding(draw: &mut Draw, frames: usize, lane: f64, rate: f64, speed: f64) -> Vec<Pose> {
+    const AHEAD: f64 = 1.6;
+    /// Yaw at which it turns back, in radians.
+    const MOST: f64 = 0.12;
+    let (mut x, mut z, mut yaw) = (lane, 0.0, 0.0f64);
+    let mut turn = rate.to_radians();
+    let mut poses = Vec::with_capacity(frames);
+    for _ in 0..frames {
+        let camera = [x + AHEAD * libm::sin(yaw), 0.0, z + AHEAD * libm::cos(yaw)];
+        poses.push(Pose::new(camera, yaw, draw.normal(0.002)));
+        let half = yaw + 0.5 * turn;
+        x += speed * libm::sin(half);
+        z += speed * libm::cos(half);
+        yaw += turn;
+        if yaw.abs() > MOST && yaw * turn > 0.0 {
+            turn = -turn;
+        }
+    }
+    poses
+}
+
 /// A posed pinhole camera of a given picture size. A pixel `(u, v)`, centres at whole numbers, sees along
 /// `R ((u - cx)/fx, (v - cy)/fy, 1)`, so the parameter along the ray *is* the depth.
 #[derive(Clone, Copy, Debug)]

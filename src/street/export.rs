@@ -12,11 +12,13 @@
 //! OUT/camera.toml
 //! OUT/0000/000000.jpg
 //! OUT/0000/depth/000000.png
+//! OUT/0000/right/000000.jpg of a second camera
 //! ```
 
 use std::path::Path;
 use std::{fs, io};
 
+use image::RgbImage;
 use image::codecs::jpeg::JpegEncoder;
 
 use super::{Pose, Street, StreetConfig};
@@ -69,8 +71,8 @@ pub fn write(street: &Street, out: &Path) -> Result<()> {
     text(&out.join("splits/train_files.txt"), &split)
 }
 
-/// Writes a folder of JPEG frames for each sequence, exact depth beside them (as in [`write()`]), and the camera in
-/// `camera.toml`. Refuses a folder that exists and is not empty.
+/// Writes a folder of JPEG frames for each sequence, exact depth (as in [`write()`]) and the second camera's frames beside
+/// them, and the camera in `camera.toml`. Refuses a folder that exists and is not empty.
 ///
 /// # Errors
 /// If the folder is not empty, or a file cannot be written.
@@ -80,23 +82,33 @@ pub fn write_frames(street: &Street, out: &Path) -> Result<()> {
     folder(out)?;
     let (w, h, k) = (config.width as f64, config.height as f64, config.intrinsics);
     let (fx, fy, cx, cy) = (k.fx * w, k.fy * h, k.cx * w, k.cy * h);
-    let camera = format!("width = {w}\nheight = {h}\nfx = {fx:?}\nfy = {fy:?}\ncx = {cx:?}\ncy = {cy:?}\n");
+    let mut camera = format!("width = {w}\nheight = {h}\nfx = {fx:?}\nfy = {fy:?}\ncx = {cx:?}\ncy = {cy:?}\n");
+    if config.baseline != 0.0 {
+        camera += &format!("baseline = {:?}\n", config.baseline);
+    }
     text(&out.join("camera.toml"), &camera)?;
     for sequence in 0..config.sequences {
         let frames = out.join(format!("{sequence:04}"));
         folder(&frames.join("depth"))?;
+        if config.baseline != 0.0 {
+            folder(&frames.join("right"))?;
+        }
         for frame in 0..config.frames {
-            let picture = street.frame(sequence, frame);
-            write_atomically(frames.join(format!("{frame:06}.jpg")), |file| {
-                JpegEncoder::new_with_quality(file, JPEG_QUALITY)
-                    .encode_image(picture.as_ref())
-                    .map_err(io::Error::other)
-            })?;
+            write_jpeg(&frames.join(format!("{frame:06}.jpg")), street.frame(sequence, frame))?;
+            if let Some(picture) = street.right_frame(sequence, frame) {
+                write_jpeg(&frames.join(format!("right/{frame:06}.jpg")), picture)?;
+            }
             let depth = clipped_depth(street, sequence, frame);
             write_depth_png(frames.join(format!("depth/{frame:06}.png")), &depth)?;
         }
     }
     Ok(())
+}
+
+fn write_jpeg(path: &Path, picture: &RgbImage) -> Result<()> {
+    write_atomically(path, |file| {
+        JpegEncoder::new_with_quality(file, JPEG_QUALITY).encode_image(picture).map_err(io::Error::other)
+    })
 }
 
 /// Quality of JPEG frames, of 100: as cameras store them.

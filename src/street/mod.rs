@@ -23,3 +23,5 @@ mod world;
 
 pub use camera::Pose;
 pub use rendered::{Street, StreetConfig};
+#[cfg(test)]
+pub(crate) use {camera::winding, draw::Draw};

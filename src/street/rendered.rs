@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::build::street;
-use super::camera::{Pose, View, drive};
+use super::camera::{Pose, View, drive, winding};
 use super::draw::Draw;
 use super::render::Scene;
 use super::world::World;
@@ -85,6 +85,21 @@ impl Street {
             )
         };
         Street::film(config, &sequence, progress)
+    }
+
+    /// Renders the streets of `config` along paths that wind, `rate` degrees a frame to one side, then to the other. All else
+    /// is as in [`Street::render`].
+    pub fn render_winding(
+        config: &StreetConfig,
+        rate: f64,
+        progress: Option<&(dyn Fn(usize, usize) + Sync)>,
+    ) -> Street {
+        let path = |k: usize, world: &World| {
+            let mut draw = Draw::new(config.seed, k as u64, PATH);
+            let speed = draw.range(0.55, 0.95);
+            winding(&mut draw, config.frames, world.lane, rate, speed)
+        };
+        Street::film(config, &path, progress)
     }
 
     /// Renders the streets of `config` along given paths, one a sequence: camera poses, one a frame. Its `sequences` and

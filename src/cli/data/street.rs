@@ -34,9 +34,13 @@ pub struct Args {
     /// Focal lengths and principal point of the camera, in pixels [default: KITTI's, for any size].
     #[arg(long, value_name = "FX,FY,CX,CY", value_parser = crate::cli::pinhole)]
     intrinsics: Option<[f64; 4]>,
-    /// A second camera so far to the right, image_03: 0.54 is KITTI's distance [default: one camera].
+    /// A second camera so far to the right: 0.54 is KITTI's distance [default: one camera].
     #[arg(long, value_name = "METRES")]
     baseline: Option<f64>,
+    /// Drive along winding paths, which turn so many degrees a frame, to one side and then to the other [default: a drive that
+    /// holds its lane and hardly turns].
+    #[arg(long, value_name = "DEGREES", conflicts_with = "moving_cars")]
+    turn: Option<f64>,
     /// Add moving cars.
     #[arg(long)]
     moving_cars: bool,
@@ -66,8 +70,8 @@ pub fn run(a: Args) -> Result<()> {
     if a.baseline.is_some_and(|b| !(b > 0.0 && b <= 10.0)) {
         return Err(Error::setting("--baseline", format!("{baseline} is not a distance above 0, up to 10 metres")));
     }
-    if baseline > 0.0 && a.layout == Layout::Frames {
-        return Err(Error::setting("--baseline", "folders of frames hold one camera: take --layout kitti"));
+    if a.turn.is_some_and(|rate| !(rate > 0.0 && rate <= 5.0)) {
+        return Err(Error::setting("--turn", "expected degrees a frame above 0, up to 5"));
     }
     let cameras = if baseline > 0.0 { 2 } else { 1 };
     // All pictures are held until they are written.
@@ -100,7 +104,10 @@ pub fn run(a: Args) -> Result<()> {
             progress.set(done as u64, "");
         }
     };
-    let street = Street::render(&config, Some(&report));
+    let street = match a.turn {
+        Some(rate) => Street::render_winding(&config, rate, Some(&report)),
+        None => Street::render(&config, Some(&report)),
+    };
     match a.layout {
         Layout::Kitti => export::write(&street, &a.out)?,
         Layout::Frames => export::write_frames(&street, &a.out)?,

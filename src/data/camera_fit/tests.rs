@@ -1,8 +1,7 @@
 //! On streets, whose camera is known: plain drives, and paths that turn.
 
 use super::*;
-use crate::random::Random;
-use crate::street::{Pose, Street, StreetConfig};
+use crate::street::{self, Draw, Pose, Street, StreetConfig};
 
 /// A street seen through a camera that is said to be another one.
 struct Claimed<'a>(&'a Street, Intrinsics);
@@ -34,26 +33,8 @@ fn claimed(street: &Street, factor: f64, moved: [f64; 2]) -> CameraFit {
     fits.into_iter().next().unwrap()
 }
 
-/// A path that winds: `rate` degrees a frame to one side, then to the other, at `speed` metres a frame. The camera hangs
-/// 1.6 m ahead of the rear axle, which is what follows its own direction.
 fn winding(seed: u64, frames: usize, rate: f64, speed: f64) -> Vec<Pose> {
-    const AHEAD: f64 = 1.6;
-    const MOST: f64 = 0.12;
-    let mut random = Random::new(seed, 0);
-    let (mut x, mut z, mut yaw) = (0.0, 0.0, 0.0f64);
-    let mut turn = rate.to_radians();
-    let mut poses = Vec::new();
-    for _ in 0..frames {
-        poses.push(Pose::new([x + AHEAD * yaw.sin(), 0.0, z + AHEAD * yaw.cos()], yaw, 0.002 * random.normal()));
-        let half = yaw + 0.5 * turn;
-        x += speed * half.sin();
-        z += speed * half.cos();
-        yaw += turn;
-        if yaw.abs() > MOST && yaw * turn > 0.0 {
-            turn = -turn;
-        }
-    }
-    poses
+    street::winding(&mut Draw::new(seed, 0, 0), frames, 0.0, rate, speed)
 }
 
 fn config(seed: u64, height: usize, width: usize, sequences: usize, frames: usize) -> StreetConfig {

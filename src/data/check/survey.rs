@@ -7,7 +7,9 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use super::times;
+use crate::data::frames::picture_files;
 use crate::data::inputs::find_pictures;
+use crate::data::kitti::is_kitti;
 use crate::formats::picture::check_picture;
 use crate::{Error, Result};
 
@@ -69,14 +71,16 @@ pub(in crate::data) fn frame_files(root: &Path) -> Result<Vec<PathBuf>> {
     if !root.is_dir() {
         return Err(Error::file(root, "expected a folder of frames; check the path"));
     }
+    if !is_kitti(root)? {
+        return picture_files(root);
+    }
     let pictures = find_pictures(&[root.to_owned()], Path::new(""))?.pictures.into_iter().map(|picture| picture.path);
+    let is_passed_over = |below: &Path| {
+        below.iter().any(|part| ["depth", "proj_depth", "image_00", "image_01"].iter().any(|known| part == *known))
+    };
     let is_frame =
         |path: &PathBuf| !is_passed_over(path.strip_prefix(root).ok().and_then(Path::parent).unwrap_or(root));
     Ok(pictures.filter(is_frame).collect())
-}
-
-fn is_passed_over(below: &Path) -> bool {
-    below.iter().any(|part| ["depth", "proj_depth", "image_00", "image_01"].iter().any(|known| part == *known))
 }
 
 fn look(root: &Path, path: &Path, pictures: &[PathBuf]) -> Folder {

@@ -31,7 +31,7 @@ struct Projection {
 }
 
 impl Projection {
-    fn read(entries: &Entries, camera: &str) -> Result<Self> {
+    fn read(entries: &CalibrationLines, camera: &str) -> Result<Self> {
         let size = entries.size(&format!("S_rect_{camera}"))?;
         Ok(Projection { size, matrix: entries.numbers(&format!("P_rect_{camera}"))? })
     }
@@ -55,7 +55,7 @@ impl Calibration {
 
     /// The measured intrinsics of one camera, whatever the file says of the other: `P_rect` over `S_rect`.
     pub fn intrinsics_of(day: &Path, side: Side) -> Result<Intrinsics> {
-        let entries = Entries::read(day.join(CAMERAS))?;
+        let entries = CalibrationLines::read(day.join(CAMERAS))?;
         let camera = match side {
             Side::Left => "02",
             Side::Right => "03",
@@ -67,13 +67,13 @@ impl Calibration {
 
     /// Reads the files in the folder of a day; that of the LiDAR only `with_lidar`.
     pub fn read(day: &Path, with_lidar: bool) -> Result<Calibration> {
-        let cameras = Entries::read(day.join(CAMERAS))?;
+        let cameras = CalibrationLines::read(day.join(CAMERAS))?;
         let cameras_of_sides = [Projection::read(&cameras, "02")?, Projection::read(&cameras, "03")?];
         let [width, height] = cameras_of_sides[0].size;
         let lidar_to_rectified = match with_lidar {
             false => None,
             true => {
-                let lidar = Entries::read(day.join(LIDAR))?;
+                let lidar = CalibrationLines::read(day.join(LIDAR))?;
                 let rectify = rigid(cameras.numbers("R_rect_00")?, [0.0; 3]);
                 Some(product(&rectify, &rigid(lidar.numbers("R")?, lidar.numbers("T")?)))
             }
@@ -140,7 +140,7 @@ impl StereoPair {
     /// # Errors
     /// If one is missing, stands there twice or cannot be, or the right camera is not to the right of the left one.
     pub(in crate::data) fn read(path: &Path, [left, right]: [&str; 2]) -> Result<StereoPair> {
-        let entries = Entries::read(path.to_owned())?;
+        let entries = CalibrationLines::read(path.to_owned())?;
         let pair = StereoPair { left: Projection::read(&entries, left)?, right: Projection::read(&entries, right)? };
         if pair.left.matrix[0] > 0.0 && pair.baseline() > 0.0 {
             return Ok(pair);
@@ -174,14 +174,14 @@ fn product<const N: usize>(a: &[f64; N], b: &[f64; 16]) -> [f64; N] {
     std::array::from_fn(|i| (0..4).map(|k| a[i / 4 * 4 + k] * b[4 * k + i % 4]).sum())
 }
 
-/// The lines of a calibration file.
-struct Entries {
+/// The lines of a calibration file, `KEY: numbers`.
+pub(in crate::data) struct CalibrationLines {
     path: PathBuf,
     values: HashMap<String, String>,
 }
 
-impl Entries {
-    fn read(path: PathBuf) -> Result<Entries> {
+impl CalibrationLines {
+    pub(in crate::data) fn read(path: PathBuf) -> Result<CalibrationLines> {
         let text = read_text(&path, MAX_SETTINGS, "a calibration")?;
         let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
         let mut values = HashMap::new();
@@ -191,11 +191,11 @@ impl Entries {
                 return Err(Error::file(path, format!("{key}: stands there twice; leave the right line of it")));
             }
         }
-        Ok(Entries { path, values })
+        Ok(CalibrationLines { path, values })
     }
 
     /// The `N` finite numbers of a key.
-    fn numbers<const N: usize>(&self, key: &str) -> Result<[f64; N]> {
+    pub(in crate::data) fn numbers<const N: usize>(&self, key: &str) -> Result<[f64; N]> {
         let wrong = |found: String| Error::file(&self.path, format!("{key}: expected {N} numbers, found {found}"));
         let text = self.values.get(key).ok_or_else(|| wrong("no such line".to_owned()))?;
         let number = |word: &str| match word.parse::<f64>() {

@@ -22,11 +22,10 @@ use image::RgbImage;
 
 use crate::formats::depth_png::read_depth_png;
 pub use calibration::Calibration;
-pub(super) use calibration::StereoPair;
+pub(super) use calibration::{CalibrationLines, StereoPair};
 pub use lidar::{DepthAxis, project_scan, read_scan};
 pub use split::{Side, SplitLine, read_split};
 
-use super::augment::flip_intrinsics;
 use super::cache::Pictures;
 use super::camera::{self, Camera};
 use super::{DataSource, Place};
@@ -551,10 +550,8 @@ impl DataSource for Kitti {
         self.camera(sample).intrinsics
     }
 
-    /// The published constants stay as they are, as in the published training.
     fn mirrored_intrinsics(&self, sample: usize, width: usize) -> Intrinsics {
-        let camera = self.camera(sample);
-        if camera.published { camera.intrinsics } else { flip_intrinsics(camera.intrinsics, width) }
+        camera::mirrored(self.camera(sample), width)
     }
 
     fn cameras(&self) -> Vec<String> {

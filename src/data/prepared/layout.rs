@@ -18,7 +18,7 @@ use crate::data::check::frame_files;
 use crate::{Error, Result};
 
 const MAGIC: &[u8; 8] = b"PLXFRAME";
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 const HEADER: u64 = 40;
 /// Bytes of a frame in the list, without its name; in the table of checksums.
 const LISTED: u64 = 24;

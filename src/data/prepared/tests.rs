@@ -138,7 +138,7 @@ fn other_versions_sizes_and_what_is_cut_off_or_lies_are_refused() {
         changed
     };
     for (bytes, what) in [
-        (with(8, &2u32.to_le_bytes()), "version 2"),
+        (with(8, &1u32.to_le_bytes()), "version 1"),
         (with(0, b"X"), "no file of prepared frames"),
         (whole[..20].to_vec(), "no file of prepared frames"),
         (whole[..whole.len() - 1].to_vec(), "bytes, which are not those of 10 frames of 9x6"),

@@ -14,6 +14,8 @@ use rayon::prelude::*;
 use super::layout::{Layout, Source, checksum};
 use super::{Prepared, change, file_name, read_frame, read_table};
 use crate::data::cache::{read_resized, side};
+use crate::data::frames;
+use crate::data::kitti::is_kitti;
 use crate::formats::atomic::appear;
 use crate::{Error, Result};
 
@@ -48,6 +50,7 @@ pub fn prepare(
 ) -> Result<Outcome> {
     let path = out.map_or_else(|| root.join(file_name(size)), Path::to_owned);
     let [height, width] = [side("height", size[0])?, side("width", size[1])?];
+    let used_rows = if is_kitti(root)? { 1.0 } else { frames::Layout::of(root)?.used_rows() };
     let layout = Layout { height, width, sources: Source::all(root)? };
     // A file of another time, size or version is made anew.
     if let Ok(there) = Prepared::open(&path, root, size)
@@ -65,7 +68,7 @@ pub fn prepare(
     let missing: Vec<usize> = (0..table.len()).filter(|&frame| !table[frame]).collect();
     missing.into_par_iter().try_for_each(|frame| {
         let source = &layout.sources[frame].name;
-        match read_resized(&root.join(source), width, height) {
+        match read_resized(&root.join(source), used_rows, width, height) {
             Ok(picture) => {
                 let mut file = file.lock().unwrap_or_else(PoisonError::into_inner);
                 put(&mut file, &layout, frame, picture.as_raw()).map_err(|e| Error::io(&partial, e))?;

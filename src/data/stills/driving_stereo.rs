@@ -63,7 +63,7 @@ pub(super) fn add(stills: &mut Stills, root: &Path, camera: Camera) -> Result<()
             let named = |what: &str| of(what, size).join(format!("{frame}.png"));
             let truth = match of("depth-map", size).is_dir() {
                 true => Truth::DepthPng(named("depth-map")),
-                false => Truth::DisparityPng { path: named("disparity-map"), steps, focal_baseline },
+                false => Truth::DisparityPng { path: named("disparity-map"), zero: 0, steps, focal_baseline },
             };
             let right = picture.file_name().map(|name| of("right-image", size).join(name)).filter(|p| p.is_file());
             let name = format!("{folder} {frame}");

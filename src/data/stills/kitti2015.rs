@@ -41,6 +41,7 @@ pub(super) fn add(stills: &mut Stills, root: &Path, camera: Camera) -> Result<()
         let name = picture.file_name().unwrap_or_default();
         let right = Some(folder.join("image_3").join(name)).filter(|path| path.is_file());
         let truth = Truth::DisparityPng {
+            zero: 0,
             path: folder.join("disp_occ_0").join(name),
             steps: 256.0,
             focal_baseline: intrinsics.fx * width * baseline,

@@ -8,7 +8,6 @@ mod make3d;
 mod middlebury;
 #[cfg(test)]
 mod tests;
-mod truth;
 
 use std::collections::HashMap;
 use std::fs;
@@ -21,13 +20,13 @@ use super::camera::{self, Camera, Found};
 use super::inputs::natural_order;
 use super::kitti::LeftOut;
 use super::resize::lanczos;
+use super::truth::Truth;
 use super::{DataSource, Place};
 use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
 use crate::formats::bounded::read_text;
 use crate::formats::picture::read_picture;
 use crate::{Error, Result};
-use truth::Truth;
 
 /// A list of a million pictures has fewer bytes.
 const MAX_LIST: u64 = 64 << 20;

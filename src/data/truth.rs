@@ -15,10 +15,11 @@ use crate::{Error, Result};
 pub(super) enum Truth {
     /// A 16-bit grey PNG of metres times 256, 0 for none.
     DepthPng(PathBuf),
-    /// A 16-bit grey PNG of disparity times `steps`, 0 for none; depth is `focal_baseline / disparity`.
+    /// A 16-bit grey PNG of `steps` times disparity, plus `zero`, 0 for none; depth is `focal_baseline / disparity`.
     DisparityPng {
         path: PathBuf,
         steps: f64,
+        zero: u16,
         /// Focal length in pixels times the baseline in metres.
         focal_baseline: f64,
     },
@@ -40,8 +41,8 @@ impl Truth {
     pub(super) fn read(&self) -> Result<DepthMap> {
         match self {
             Truth::DepthPng(path) => grey16(path, "depth (metres times 256, 0 for none)", |v| f64::from(v) / 256.0),
-            Truth::DisparityPng { path, steps, focal_baseline } => {
-                let depth = |v| if v == 0 { 0.0 } else { focal_baseline * steps / f64::from(v) };
+            Truth::DisparityPng { path, steps, zero, focal_baseline } => {
+                let depth = |v| if v == 0 { 0.0 } else { focal_baseline * steps / (f64::from(v) - f64::from(*zero)) };
                 grey16(path, &format!("disparity (pixels times {steps}, 0 for none)"), depth)
             }
             Truth::DisparityPfm { path, focal_baseline, offset } => {
