@@ -64,22 +64,34 @@ fn to_byte(sum: i32) -> u8 {
     ((sum + (1 << (FRACTION_BITS - 1))) >> FRACTION_BITS).clamp(0, 255) as u8
 }
 
+/// Rows that are resized together: their values at one place lie side by side, so that sums are taken of all at once.
+const TOGETHER: usize = 16;
+
 fn resize_columns(bytes: &[u8], in_width: usize, height: usize, width: usize) -> Vec<u8> {
     if in_width == width {
         return bytes.to_vec();
     }
     let windows = windows(in_width, width);
     let mut out = vec![0; width * height * 3];
-    for (row, out_row) in bytes.chunks_exact(in_width * 3).zip(out.chunks_exact_mut(width * 3)) {
-        for (window, pixel) in windows.iter().zip(out_row.chunks_exact_mut(3)) {
-            let mut sums = [0i32; 3];
-            for (rgb, &w) in row[window.first * 3..].chunks_exact(3).zip(&window.weights) {
-                for (sum, &c) in sums.iter_mut().zip(rgb) {
-                    *sum += i32::from(c) * w;
-                }
+    let mut turned = vec![[0u8; TOGETHER]; in_width * 3];
+    for (rows, out_rows) in bytes.chunks(in_width * 3 * TOGETHER).zip(out.chunks_mut(width * 3 * TOGETHER)) {
+        for (k, row) in rows.chunks_exact(in_width * 3).enumerate() {
+            for (column, &value) in turned.iter_mut().zip(row) {
+                column[k] = value;
             }
-            for (byte, sum) in pixel.iter_mut().zip(sums) {
-                *byte = to_byte(sum);
+        }
+        for (x, window) in windows.iter().enumerate() {
+            for channel in 0..3 {
+                let columns = turned[window.first * 3 + channel..].iter().step_by(3);
+                let mut sums = [0i32; TOGETHER];
+                for (column, &w) in columns.zip(&window.weights) {
+                    for (sum, &c) in sums.iter_mut().zip(column) {
+                        *sum += i32::from(c) * w;
+                    }
+                }
+                for (row, sum) in out_rows.chunks_exact_mut(width * 3).zip(sums) {
+                    row[x * 3 + channel] = to_byte(sum);
+                }
             }
         }
     }
