@@ -48,7 +48,7 @@ fn moments(place: &Path, batches: &[[usize; 2]], freeze: &str) -> Vec<Named> {
     let (model, params) = MonoVit::new(config.model(), 0);
     let mut trainer = Trainer::of(model, params, config.plan());
     trainer.freeze(&[freeze.to_owned()]).expect("there are such");
-    let (plain, street) = (Augment { flip: false, jitter: false }, street(1));
+    let (plain, street) = (Augment { flip: false, jitter: false, sensor: false }, street(1));
     let batch =
         |[size, step]: [usize; 2]| batch_of_step(street.as_ref(), plain, size, 0, step as u64).expect("a batch");
     let batches: Vec<_> = batches.iter().copied().map(batch).collect();

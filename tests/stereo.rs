@@ -1,7 +1,7 @@
 //! Training on stereo pairs: alone, and together with neighbours in time.
 
 use parallax::data::batch::{Augment, Batch, Making, batch_of_step};
-use parallax::data::stereo::{Baseline, Sources};
+use parallax::data::stereo::Sources;
 use parallax::monovit::Preset;
 use parallax::street::{Street, StreetConfig};
 use parallax::tensor::Tensor;
@@ -15,7 +15,7 @@ fn street() -> Street {
 }
 
 fn making(sources: Sources) -> Making {
-    Making { augment: Augment { flip: true, jitter: true }, sources, baseline: Baseline::Calibrated }
+    Making { augment: Augment { flip: true, jitter: true, sensor: false }, sources, ..Making::default() }
 }
 
 fn config(sources: Sources) -> RunConfig {
@@ -83,7 +83,7 @@ fn validation_takes_the_smallest_error_over_all_sources() {
     let errors = |sources: Sources, change: &dyn Fn(&mut Batch)| {
         let config = config(sources);
         let trainer = Trainer::new(config.model(), config.plan());
-        let plain = Making { augment: Augment { flip: false, jitter: false }, ..making(sources) };
+        let plain = Making { augment: Augment { flip: false, jitter: false, sensor: false }, ..making(sources) };
         let mut batch = batch_of_step(&street, plain, 2, 0, 0).expect("a batch");
         change(&mut batch);
         trainer.validate(&trainer.params, &[batch])

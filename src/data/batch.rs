@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize};
 use super::DataSource;
 use super::augment::{Jitter, flip};
 use super::resize::lanczos;
+use super::sensor::Sensor;
 use super::stereo::{Baseline, Sources};
 use crate::camera::Intrinsics;
 use crate::error::{Error, Result};
@@ -28,11 +29,14 @@ pub struct Augment {
     pub flip: bool,
     /// Change its colours with probability 1/2: the networks see the changed images, the loss the plain ones.
     pub jitter: bool,
+    /// Show the networks what [another camera or another weather](super::sensor) would have made of it; the loss the plain
+    /// images.
+    pub sensor: bool,
 }
 
 impl Default for Augment {
     fn default() -> Self {
-        Augment { flip: true, jitter: true }
+        Augment { flip: true, jitter: true, sensor: false }
     }
 }
 
@@ -45,6 +49,8 @@ pub struct Making {
     pub sources: Sources,
     /// The unit of the distance between two cameras.
     pub baseline: Baseline,
+    /// Whether batches hold the targets' depth.
+    pub depth: bool,
 }
 
 impl From<Augment> for Making {
@@ -71,13 +77,15 @@ pub struct Batch {
     pub shifts: Option<Vec<f64>>,
     /// fx, fy, cx, cy of each sample in pixels.
     pub intrinsics: Vec<[f64; 4]>,
+    /// The targets' depth `[B, h, w, 1]` in metres, if it is asked for: 0 where it is unknown, infinite in the sky.
+    pub depth: Option<Tensor<f32>>,
 }
 
 impl Batch {
     /// Targets and their neighbours in time, which the networks see as they are.
     pub fn in_time(pyramid: Vec<Tensor<f32>>, neighbours: [Tensor<f32>; 2], intrinsics: Vec<[f64; 4]>) -> Self {
         let (target, sources) = (pyramid[0].clone(), neighbours.to_vec());
-        Batch { pyramid, sources, target, neighbours: Some(neighbours), shifts: None, intrinsics }
+        Batch { pyramid, sources, target, neighbours: Some(neighbours), shifts: None, intrinsics, depth: None }
     }
 
     /// The sources at 1/2, 1/4, 1/8 of their size, made like the target's pyramid: for each scale all sources,
@@ -278,13 +286,14 @@ fn assemble(
     step: u64,
     skip: Option<&SkipList>,
 ) -> Result<Batch> {
-    let Making { augment, sources, baseline } = making;
+    let Making { augment, sources, baseline, depth } = making;
     let samples = samples_of_step(data.len(), batch, seed, step);
     let mut random = Random::of(seed, Stream::Augmentation(step));
     let mut stacks = Stacks::default();
     for sample in samples {
         let (mirrored, jitter) = (random.coin() && augment.flip, Jitter::draw(random.chacha()));
         let jitter = jitter.filter(|_| augment.jitter);
+        let sensor = augment.sensor.then(|| Sensor::draw(random.chacha()));
         let (sample, frames) = match skip {
             Some(skip) => skip.read(data, sample, sources)?,
             None => (sample, Frames::read(data, sample, sources)?),
@@ -293,9 +302,45 @@ fn assemble(
         let (w, h) = frames.target.dimensions();
         let camera = if mirrored { data.mirrored_intrinsics(sample, w as usize) } else { data.intrinsics(sample) };
         stacks.intrinsics.push(in_pixels(camera, w as usize, h as usize));
-        stacks.add(frames, jitter.as_ref(), baseline);
+        if depth {
+            stacks.depths.push(depth_of(data, sample, [h as usize, w as usize], mirrored)?);
+        }
+        stacks.add(frames, &Seen { jitter, sensor }, baseline);
     }
     Ok(stacks.batch())
+}
+
+/// The depth of a sample's target at `[h, w]` pixels, the nearest ones of the ground truth: metres, 0 for unknown, infinite
+/// for the sky.
+///
+/// # Errors
+/// If there is none.
+fn depth_of(data: &dyn DataSource, sample: usize, [h, w]: [usize; 2], mirrored: bool) -> Result<Vec<f32>> {
+    let Some(map) = data.depth(sample)? else {
+        let message = format!("{} has no ground-truth depth to learn from: set it to 0", data.name(sample));
+        return Err(Error::setting("loss.depth_supervision", message));
+    };
+    let sky = if data.zero_depth_is_sky() { f32::INFINITY } else { 0.0 };
+    let pixel = |y: usize, x: usize| {
+        let x = if mirrored { w - 1 - x } else { x };
+        let nearest = |at: usize, of: usize, size: usize| ((2 * at + 1) * size / (2 * of)).min(size - 1);
+        let metres = map.metres[nearest(y, h, map.height) * map.width + nearest(x, w, map.width)];
+        if metres > 0.0 { metres } else { sky }
+    };
+    Ok((0..h).flat_map(|y| (0..w).map(move |x| (y, x))).map(|(y, x)| pixel(y, x)).collect())
+}
+
+/// How the networks see the frames of a sample.
+struct Seen {
+    jitter: Option<Jitter>,
+    sensor: Option<Sensor>,
+}
+
+impl Seen {
+    fn of(&self, image: &Arc<RgbImage>, frame: u64) -> Arc<RgbImage> {
+        let jittered = self.jitter.as_ref().map_or_else(|| image.clone(), |jitter| Arc::new(jitter.apply(image)));
+        self.sensor.as_ref().map_or(jittered.clone(), |sensor| Arc::new(sensor.apply(&jittered, frame)))
+    }
 }
 
 /// The images of a batch while it grows.
@@ -308,12 +353,12 @@ struct Stacks {
     other: Vec<Arc<RgbImage>>,
     shifts: Vec<f64>,
     intrinsics: Vec<[f64; 4]>,
+    depths: Vec<Vec<f32>>,
 }
 
 impl Stacks {
-    fn add(&mut self, frames: Frames, jitter: Option<&Jitter>, baseline: Baseline) {
-        let seen = |image: &Arc<RgbImage>| jitter.map_or_else(|| image.clone(), |j| Arc::new(j.apply(image)));
-        self.target.push(seen(&frames.target));
+    fn add(&mut self, frames: Frames, seen: &Seen, baseline: Baseline) {
+        self.target.push(seen.of(&frames.target, 0));
         let mut smaller = frames.target;
         for (scale, pyramid) in self.pyramids.iter_mut().enumerate() {
             if scale > 0 {
@@ -322,7 +367,7 @@ impl Stacks {
             pyramid.push(smaller.clone());
         }
         for (i, image) in frames.neighbours.into_iter().flatten().enumerate() {
-            self.neighbours[i].push(seen(&image));
+            self.neighbours[i].push(seen.of(&image, 1 + i as u64));
             self.plain_neighbours[i].push(image);
         }
         if let Some((image, metres)) = frames.other {
@@ -333,6 +378,11 @@ impl Stacks {
 
     fn batch(self) -> Batch {
         let tensor = |images: Vec<Arc<RgbImage>>| to_tensor(&images.iter().map(Arc::as_ref).collect::<Vec<_>>());
+        let size = self.target[0].dimensions();
+        let depth = (!self.depths.is_empty()).then(|| {
+            let shape = [self.depths.len(), size.1 as usize, size.0 as usize, 1];
+            Tensor::from_vec(shape, self.depths.concat())
+        });
         let sources = self.plain_neighbours.into_iter().chain([self.other]).filter(|images| !images.is_empty());
         Batch {
             sources: sources.map(tensor).collect(),
@@ -341,6 +391,7 @@ impl Stacks {
             neighbours: (!self.neighbours[0].is_empty()).then(|| self.neighbours.map(tensor)),
             shifts: (!self.shifts.is_empty()).then_some(self.shifts),
             intrinsics: self.intrinsics,
+            depth,
         }
     }
 }
@@ -442,7 +493,7 @@ mod tests {
     fn smaller_sources_are_made_like_the_pyramid_of_the_target() {
         let config = StreetConfig { height: 64, width: 96, sequences: 1, frames: 5, ..StreetConfig::default() };
         let street = Street::render(&config, None);
-        let plain = Augment { flip: false, jitter: false };
+        let plain = Augment { flip: false, jitter: false, sensor: false };
         let mut batch = batch_of_step(&street, plain, 2, 0, 0).unwrap();
         batch.sources[1] = batch.pyramid[0].clone();
         let smaller = batch.smaller_sources();
@@ -484,7 +535,7 @@ mod tests {
     fn a_mirrored_street_warps_as_well_as_the_street() {
         let street = Street::render(&StreetConfig { sequences: 2, frames: 6, ..StreetConfig::default() }, None);
         let samples = samples_of_step(street.len(), 4, 0, 0);
-        let of = |flip: bool| batch_of_step(&street, Augment { flip, jitter: false }, 4, 0, 0).unwrap();
+        let of = |flip: bool| batch_of_step(&street, Augment { flip, jitter: false, sensor: false }, 4, 0, 0).unwrap();
         let (plain, mixed) = (of(false), of(true));
         let each = 3 * 96 * 320;
         let parts = plain.pyramid[0].data().chunks(each).zip(mixed.pyramid[0].data().chunks(each));
@@ -528,8 +579,8 @@ mod tests {
         let street = Street::render(&config, None);
         let samples = samples_of_step(street.len(), 4, 0, 0);
         let of = |flip: bool, sources: Sources| {
-            let augment = Augment { flip, jitter: false };
-            batch_of_step(&street, Making { augment, sources, baseline: Baseline::Calibrated }, 4, 0, 0).unwrap()
+            let augment = Augment { flip, jitter: false, sensor: false };
+            batch_of_step(&street, Making { augment, sources, ..Making::default() }, 4, 0, 0).unwrap()
         };
         let (plain, mixed) = (of(false, Sources::Both), of(true, Sources::Both));
         let each = 3 * 96 * 320;
@@ -611,7 +662,7 @@ mod tests {
     fn samples_that_cannot_be_read_are_passed_over_and_counted() {
         let bad = |sample| sample == 1 || sample == 2;
         let (data, skip) = (damaged(bad), SkipList::default());
-        let plain = Augment { flip: true, jitter: false };
+        let plain = Augment { flip: true, jitter: false, sensor: false };
         let mut loader = Loader::start(data.clone(), plain, 3, 5, 0, Some(skip.clone())).unwrap();
         let again = SkipList::default();
         for step in 0..4 {

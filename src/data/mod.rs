@@ -11,11 +11,13 @@ pub mod check;
 pub mod film;
 pub mod frames;
 pub mod inputs;
+pub mod joined;
 
 pub mod kitti;
 pub mod prepared;
 pub mod pyramid;
 pub mod resize;
+pub mod sensor;
 pub mod stereo;
 pub mod stills;
 mod street;
@@ -87,6 +89,11 @@ pub trait DataSource: Send + Sync {
 
     /// Ground-truth depth of the target frame at its own size, where there is one.
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>>;
+
+    /// Whether a depth of 0 is the sky, which is infinitely far, and not unknown.
+    fn zero_depth_is_sky(&self) -> bool {
+        false
+    }
 
     /// Where the other camera of a stereo pair stands: the x of the shift that maps points of the sample's camera to
     /// points of the other one, in metres. Minus the baseline if the other one stands to the right; `None` if there is none.
@@ -229,6 +236,9 @@ impl DataSource for Subset {
     }
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {
         self.data.depth(self.samples[sample])
+    }
+    fn zero_depth_is_sky(&self) -> bool {
+        self.data.zero_depth_is_sky()
     }
     fn other_camera_at(&self, sample: usize) -> Option<f64> {
         self.data.other_camera_at(self.samples[sample])

@@ -41,6 +41,10 @@ impl DataSource for Street {
         Place { sequence, frame }
     }
 
+    fn zero_depth_is_sky(&self) -> bool {
+        true
+    }
+
     fn other_camera_at(&self, _sample: usize) -> Option<f64> {
         let baseline = self.config().baseline;
         (baseline != 0.0).then_some(-baseline)

@@ -6,6 +6,7 @@ use std::ops::Range;
 use serde::{Deserialize, Serialize};
 
 use super::setup::check_depths;
+use super::supervision::depth_error;
 use crate::error::{Error, Result};
 use crate::random::Random;
 use crate::tensor::{Float, Tensor, Var, profile};
@@ -56,6 +57,9 @@ pub struct LossConfig {
     pub auto_mask: bool,
     /// Standard deviation of the noise that decides between equal errors.
     pub tie_break: f64,
+    /// Weight of [`depth_error`](super::supervision::depth_error): supervision by known depth, where the data know it (the
+    /// street), with which predicted depth is in metres; 0, as published: none.
+    pub depth_supervision: f64,
     /// Whether the sampling grid is made for the convention it is sampled with (pixel centres), instead of the
     /// published combination (made for aligned corners, sampled without).
     pub consistent_grid: bool,
@@ -72,6 +76,7 @@ impl Default for LossConfig {
             smoothness: 1e-3,
             auto_mask: true,
             tie_break: 1e-5,
+            depth_supervision: 0.0,
             consistent_grid: false,
         }
     }
@@ -88,7 +93,12 @@ impl LossConfig {
         if !(0.0..=1.0).contains(&self.ssim) {
             return refuse("ssim", format!("{} is not a share from 0 to 1", self.ssim));
         }
-        for (field, weight) in [("smoothness", self.smoothness), ("tie_break", self.tie_break)] {
+        let weights = [
+            ("smoothness", self.smoothness),
+            ("tie_break", self.tie_break),
+            ("depth_supervision", self.depth_supervision),
+        ];
+        for (field, weight) in weights {
             if !(weight >= 0.0 && weight.is_finite()) {
                 return refuse(field, format!("{weight} is not a number from 0"));
             }
@@ -107,6 +117,9 @@ pub struct Views<T: Float> {
     pub smaller_sources: Vec<Vec<Var<T>>>,
     /// fx, fy, cx, cy of each sample, in pixels.
     pub intrinsics: Vec<[f64; 4]>,
+    /// The target's depth `[B, H, W, 1]` in metres (0: unknown, infinite: the sky), for
+    /// [`depth_supervision`](LossConfig::depth_supervision).
+    pub depth: Option<Tensor<T>>,
 }
 
 impl<T: Float> Views<T> {
@@ -120,6 +133,7 @@ impl<T: Float> Views<T> {
             sources: self.sources[which.clone()].to_vec(),
             smaller_sources: self.smaller_sources.iter().map(|sources| sources[which.clone()].to_vec()).collect(),
             intrinsics: self.intrinsics.clone(),
+            depth: self.depth.clone(),
         }
     }
 }
@@ -138,6 +152,9 @@ pub struct Loss<T: Float> {
     pub smoothness: f64,
     /// Share of pixels that auto-masking leaves in: those that a warped neighbour explains best.
     pub auto_mask: f64,
+    /// The distance to known depth ([`depth_error`](super::supervision::depth_error)), not weighted; 0 where none is asked
+    /// for.
+    pub depth_error: f64,
 }
 
 impl<T: Float> Loss<T> {
@@ -150,6 +167,7 @@ impl<T: Float> Loss<T> {
             unwarped: mean(|loss| loss.unwarped),
             smoothness: mean(|loss| loss.smoothness),
             auto_mask: mean(|loss| loss.auto_mask),
+            depth_error: mean(|loss| loss.depth_error),
             total: (&self.total + &other.total).affine(0.5, 0.0),
         }
     }
@@ -204,6 +222,7 @@ pub fn loss<T: Float>(
 
     let mut parts = Vec::new();
     let (mut sum_photometric, mut sum_warped, mut sum_smoothness, mut sum_mask) = (0.0, 0.0, 0.0, 0.0);
+    let mut sum_depth = 0.0;
     for (scale, disparity) in disparities.iter().enumerate() {
         let own = scale > 0 && config.scales == Scales::Own;
         let (target, sources) = match own {
@@ -241,7 +260,13 @@ pub fn loss<T: Float>(
         let count = || winner.data().iter().filter(|w| w.f64() < warped as f64).count();
         let kept = profile::phase("pixels that auto-masking leaves", count);
         sum_mask += kept as f64 / winner.len().max(1) as f64;
-        parts.push(error + smoothness.affine(weight, 0.0));
+        let mut part = error + smoothness.affine(weight, 0.0);
+        if let Some(known) = views.depth.as_ref().filter(|_| config.depth_supervision > 0.0 && !own) {
+            let error = depth_error(&depth, known, [config.min_depth, config.max_depth]);
+            sum_depth += error.value().item().f64();
+            part = part + error.affine(config.depth_supervision, 0.0);
+        }
+        parts.push(part);
     }
     let scales = parts.len() as f64;
     let total = parts.into_iter().reduce(|a, b| a + b).expect("at least one scale").affine(1.0 / scales, 0.0);
@@ -252,6 +277,7 @@ pub fn loss<T: Float>(
         unwarped: mean_minimum(&unwarped),
         smoothness: sum_smoothness / scales,
         auto_mask: sum_mask / scales,
+        depth_error: sum_depth / scales,
     }
 }
 
@@ -288,6 +314,7 @@ mod tests {
             sources: vec![image.clone().into(), image.into()],
             smaller_sources: vec![],
             intrinsics: vec![[18.0, 60.0, 16.0, 16.0]],
+            depth: None,
         };
         let disparity = Var::constant(Tensor::full([1, 32, 32, 1], 0.3));
         let still = Var::pose_matrix(&Tensor::zeros([1, 3]).into(), &Tensor::zeros([1, 3]).into(), false);
@@ -310,6 +337,7 @@ mod tests {
             sources: vec![image(full, 3), image(full, 4)],
             smaller_sources: vec![vec![image(half, 5), image(half, 6)]],
             intrinsics: vec![[14.0, 18.0, 12.0, 8.0], [15.0, 17.0, 11.0, 8.5]],
+            depth: None,
         };
         let disparities = vec![image([2, 16, 24, 1], 7), image([2, 8, 12, 1], 8)];
         let pose = |x: f64| {
@@ -330,6 +358,7 @@ mod tests {
                 sources: vec![views.sources[which].clone()],
                 smaller_sources: vec![],
                 intrinsics: views.intrinsics.clone(),
+                depth: None,
             };
             loss(&disparities, &transforms[which..=which], &views, &config, None).photometric
         };
@@ -352,6 +381,7 @@ mod tests {
             sources: views.smaller_sources[0].clone(),
             smaller_sources: vec![],
             intrinsics: views.intrinsics.iter().map(|k| k.map(|pixels| 0.5 * pixels)).collect(),
+            depth: None,
         };
         let first = loss(&disparities[..1], &transforms, &views, &own, None).photometric;
         let second = loss(&disparities[1..], &transforms, &smaller, &own, None).photometric;

@@ -18,6 +18,7 @@ pub mod loss;
 mod model;
 pub mod pose;
 pub mod setup;
+pub mod supervision;
 
 pub use config::{Ablation, Config, Preset};
 pub use model::MonoVit;

@@ -69,7 +69,7 @@ pub struct Street {
 
 /// What a stream of random numbers is for.
 const WORLD: u64 = 1;
-const PATH: u64 = 2;
+pub(super) const PATH: u64 = 2;
 
 impl Street {
     /// Renders all sequences, on rayon's threads; the pictures are the same for any number of them. `progress` gets the
@@ -119,7 +119,7 @@ impl Street {
     }
 
     /// Renders every sequence along the path that `path` gives for its number and its world.
-    fn film(
+    pub(super) fn film(
         config: &StreetConfig,
         path: &(dyn Fn(usize, &World) -> Vec<Pose> + Sync),
         progress: Option<&(dyn Fn(usize, usize) + Sync)>,

@@ -7,16 +7,27 @@ use super::recipe::RunConfig;
 use super::run::RunData;
 use crate::data::apart::refuse_shared;
 use crate::data::aside::set_aside;
+use crate::data::joined::Joined;
 use crate::data::{DataSource, Opening, Subset, open_folder};
 use crate::error::{Error, Result};
-use crate::street::{Street, StreetConfig};
+use crate::street::{Street, StreetConfig, varied};
 
 /// The name of the embedded street as a data set. A folder of that name is `./street`.
 pub const STREET: &str = "street";
 
+/// The name of the street that many cameras see.
+pub const STREET_2: &str = "street-2";
+
+/// Whether a data set is rendered by the program, and not a folder.
+pub fn is_rendered(data: &str) -> bool {
+    [STREET, STREET_2].contains(&data)
+}
+
 /// Sequences of the embedded street: training, validation, test. Many short drives: a street more teaches more than a
 /// few metres more of the same.
 const SEQUENCES: [usize; 3] = [144, 12, 24];
+/// Those of the street that many cameras see.
+const SEQUENCES_2: [usize; 3] = [480, 24, 24];
 /// Frames of each.
 const FRAMES: usize = 10;
 /// Where a second camera stands, if one is asked for: metres to the right, like KITTI's.
@@ -30,7 +41,11 @@ const APART: u64 = 1_000_000;
 /// # Errors
 /// If the data cannot be read, one frame is in two splits, or there are fewer samples than a batch holds.
 pub fn open(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + Sync)) -> Result<RunData> {
-    let data = if config.data == STREET { street(config, progress) } else { folder(config)? };
+    let data = match &config.data[..] {
+        STREET => street(config, progress),
+        STREET_2 => street_2(config, progress),
+        _ => folder(config)?,
+    };
     if data.train.len() < config.batch {
         let message =
             format!("{} samples a batch, but the data holds {}: make it smaller", config.batch, data.train.len());
@@ -42,7 +57,12 @@ pub fn open(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) +
 /// The bytes of pictures that are held in memory while a run goes on: all of the street's, none of a folder's.
 pub(super) fn bytes_held(config: &RunConfig) -> f64 {
     let cameras = if config.sources.other_camera() { 2 } else { 1 };
-    let frames = if config.data == STREET { cameras * SEQUENCES.iter().sum::<usize>() * FRAMES } else { 0 };
+    let sequences = match &config.data[..] {
+        STREET => SEQUENCES.iter().sum(),
+        STREET_2 => SEQUENCES_2.iter().sum(),
+        _ => 0usize,
+    };
+    let frames = cameras * sequences * FRAMES;
     3.0 * (frames * config.height * config.width) as f64
 }
 
@@ -59,6 +79,24 @@ fn street(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + S
         train: street("street", train, seed),
         validation: street("validation", validation, seed.wrapping_add(APART)),
         test: Some(street("test", test, seed.wrapping_add(2 * APART))),
+    }
+}
+
+/// The street that many cameras see.
+fn street_2(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + Sync)) -> RunData {
+    let RunConfig { height, width, seed, .. } = *config;
+    let baseline = if config.sources.other_camera() { BASELINE } else { 0.0 };
+    let streets = |what: &'static str, sequences: usize, seed: u64| -> Arc<dyn DataSource> {
+        let settings =
+            StreetConfig { height, width, sequences, frames: FRAMES, seed, baseline, ..StreetConfig::default() };
+        let streets = varied(&settings, Some(&|done, all| progress(what, done, all)));
+        Arc::new(Joined::new(streets.into_iter().map(|street| Arc::new(street) as Arc<dyn DataSource>).collect()))
+    };
+    let [train, validation, test] = SEQUENCES_2;
+    RunData {
+        train: streets("street-2", train, seed),
+        validation: streets("validation", validation, seed.wrapping_add(APART)),
+        test: Some(streets("test", test, seed.wrapping_add(2 * APART))),
     }
 }
 

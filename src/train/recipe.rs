@@ -275,7 +275,7 @@ impl RunConfig {
             freeze: Vec::new(),
             pose_first: 0.0,
             ablation: Ablation::default(),
-            augment: Augment { flip: true, jitter: false },
+            augment: Augment { flip: true, jitter: false, sensor: false },
             // Of the 3,800 steps of the default run these shares are 300, 500 before training and 600, and 100.
             auto_mask_delay: 0.0789,
             loss: LossConfig { consistent_grid: true, ..LossConfig::default() },
@@ -364,7 +364,8 @@ impl RunConfig {
 
     /// How its samples become batches.
     pub fn making(&self) -> Making {
-        Making { augment: self.augment, sources: self.sources, baseline: self.baseline }
+        let depth = self.loss.depth_supervision > 0.0;
+        Making { augment: self.augment, sources: self.sources, baseline: self.baseline, depth }
     }
 
     /// Notes how many steps a pass over so many training samples takes, and how many steps the epochs are, if those are what

@@ -212,7 +212,8 @@ mod tests {
     fn a_lesson_teaches_the_pose_networks_and_nothing_else() {
         let config = StreetConfig { height: 64, width: 96, sequences: 1, frames: 6, ..StreetConfig::default() };
         let street = Street::render(&config, None);
-        let batch = batch_of_step(&street, Augment { flip: false, jitter: false }, 2, 0, 0).expect("a batch");
+        let batch =
+            batch_of_step(&street, Augment { flip: false, jitter: false, sensor: false }, 2, 0, 0).expect("a batch");
         let (model, mut params) = MonoVit::new(Preset::Pico.config(), 0);
         // A network that answers with no motion is wrong by the angles themselves.
         for name in ["pose.net.3.weight", "pose.net.3.bias"] {

@@ -36,6 +36,9 @@ pub struct StepReport {
     pub smoothness: f64,
     /// The share of pixels that auto-masking leaves in.
     pub auto_mask: f64,
+    /// The distance to known depth, not weighted; 0 where there is no such supervision.
+    #[serde(default)]
+    pub depth_error: f64,
     /// The learning rates: encoder, decoder, pose networks.
     pub learning_rates: [f64; 3],
     /// The norm of all gradients, before clipping.
@@ -59,6 +62,7 @@ impl StepReport {
             unwarped: mean(|r| r.unwarped),
             smoothness: mean(|r| r.smoothness),
             auto_mask: mean(|r| r.auto_mask),
+            depth_error: mean(|r| r.depth_error),
             vitals: Vitals {
                 disparity: mean(|r| r.vitals.disparity),
                 disparity_spread: mean(|r| r.vitals.disparity_spread),
@@ -128,6 +132,7 @@ fn views(batch: &Batch, scales: Scales) -> Views<f32> {
         sources: batch.sources.iter().cloned().map(Var::constant).collect(),
         smaller_sources: smaller.into_iter().map(|s| s.into_iter().map(Var::constant).collect()).collect(),
         intrinsics: batch.intrinsics.clone(),
+        depth: batch.depth.clone(),
     }
 }
 
@@ -348,6 +353,7 @@ impl Trainer {
             unwarped: found.unwarped,
             smoothness: found.smoothness,
             auto_mask: found.auto_mask,
+            depth_error: found.depth_error,
             vitals: profile::phase("vitals", || {
                 let signs = Signs { disparity: &disparity, transforms: &transforms, intrinsics: &batch.intrinsics };
                 Vitals::of(&signs, &self.plan.loss)

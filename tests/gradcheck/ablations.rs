@@ -18,7 +18,7 @@ use super::whole_model::assert_taylor;
 fn batch() -> Batch {
     let config = StreetConfig { height: 64, width: 96, sequences: 1, frames: 5, ..StreetConfig::default() };
     let street = Street::render(&config, None);
-    batch_of_step(&street, Augment { flip: false, jitter: false }, 1, 0, 0).expect("a batch")
+    batch_of_step(&street, Augment { flip: false, jitter: false, sensor: false }, 1, 0, 0).expect("a batch")
 }
 
 /// Takes a step, and compares the kernel paths with the checked ones. Gives the weights before and after.

@@ -24,6 +24,7 @@ fn total(
         sources: batch.sources.iter().map(constant).collect(),
         smaller_sources: batch.smaller_sources().iter().map(|scale| scale.iter().map(constant).collect()).collect(),
         intrinsics: batch.intrinsics.clone(),
+        depth: None,
     };
     let disparities = model.disparities(&c, &target);
     let transforms = model.transforms(&c, &prev, &target, &next);
@@ -60,7 +61,8 @@ fn the_taylor_remainder_of_the_whole_loss_falls_with_the_square_of_the_step() {
 pub fn assert_taylor(sizes: Config, loss: &LossConfig, prefixes: &[&str]) {
     let config = StreetConfig { height: 64, width: 96, sequences: 1, frames: 5, ..StreetConfig::default() };
     let street = Street::render(&config, None);
-    let batch = batch_of_step(&street, Augment { flip: false, jitter: false }, 1, 0, 0).expect("a batch");
+    let batch =
+        batch_of_step(&street, Augment { flip: false, jitter: false, sensor: false }, 1, 0, 0).expect("a batch");
     let (model, params) = MonoVit::new::<f64>(sizes, 3);
     let tape = Tape::new();
     let (c, found) = total(&model, &params, &tape, &batch, loss);

@@ -70,6 +70,7 @@ impl<T: Float> Pico<T> {
             sources: ["in/prev", "in/next"].map(|n| self.reference.map(n).into()).into(),
             smaller_sources: Vec::new(),
             intrinsics: vec![intrinsics; 2],
+            depth: None,
         }
     }
 

@@ -99,7 +99,8 @@ pub fn run(path: &Path) -> Result<()> {
     }
     let intrinsics = [[0, 0], [1, 1], [0, 2], [1, 2]].map(|at| f64::from(k.at(&at)));
     let sources = vec![prev.clone(), next.clone()];
-    let views = Views { pyramid, sources, smaller_sources: Vec::new(), intrinsics: vec![intrinsics; batch] };
+    let views =
+        Views { pyramid, sources, smaller_sources: Vec::new(), intrinsics: vec![intrinsics; batch], depth: None };
 
     let tape = Tape::new();
     let c = Context::training(&params, &tape, Random::of(0, Stream::Only));
