@@ -26,7 +26,8 @@ use super::stereo::StereoArgs;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Training frames: `street` (rendered by the program), a folder or a film [default: street].
+    /// Training frames: `street` (rendered by the program), `street-2` (the same worlds seen by many cameras, for weights that
+    /// carry over to pictures that were not rendered), a folder or a film [default: street].
     ///
     /// A folder in the layout of KITTI raw, of KITTI odometry or of Cityscapes' video; or any folder of PNG, JPEG or WebP
     /// frames, in the order in which people number them, each folder inside it a sequence of its own. `camera.toml` among
@@ -35,7 +36,7 @@ pub struct Args {
     ///
     /// A film (mp4, mov, mkv, ...) is read by ffmpeg, which has to be installed: --fps frames a second are taken out into a
     /// folder beside it, which is what the run then trains on.
-    #[arg(long, value_name = "street|DIR|FILM")]
+    #[arg(long, value_name = "street|street-2|DIR|FILM")]
     data: Option<String>,
     #[command(flatten)]
     film: FilmArgs,

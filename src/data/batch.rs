@@ -311,15 +311,12 @@ fn assemble(
 }
 
 /// The depth of a sample's target at `[h, w]` pixels, the nearest ones of the ground truth: metres, 0 for unknown, infinite
-/// for the sky.
+/// for the sky; unknown everywhere if there is none.
 ///
 /// # Errors
-/// If there is none.
+/// If it cannot be read.
 fn depth_of(data: &dyn DataSource, sample: usize, [h, w]: [usize; 2], mirrored: bool) -> Result<Vec<f32>> {
-    let Some(map) = data.depth(sample)? else {
-        let message = format!("{} has no ground-truth depth to learn from: set it to 0", data.name(sample));
-        return Err(Error::setting("loss.depth_supervision", message));
-    };
+    let Some(map) = data.depth(sample)? else { return Ok(vec![0.0; h * w]) };
     let sky = if data.zero_depth_is_sky() { f32::INFINITY } else { 0.0 };
     let pixel = |y: usize, x: usize| {
         let x = if mirrored { w - 1 - x } else { x };
@@ -529,6 +526,39 @@ mod tests {
         let pairs = warped.value().data().chunks(each).zip(batch.pyramid[0].data().chunks(each));
         let sum = |(a, b): (&[f32], &[f32])| a.iter().zip(b).map(|(a, b)| f64::from((a - b).abs())).sum::<f64>();
         pairs.map(|pair| sum(pair) / each as f64).collect()
+    }
+
+    #[test]
+    fn known_depth_is_mirrored_with_the_pictures_and_the_sky_is_far() {
+        let street = Street::render(&StreetConfig { sequences: 2, frames: 6, ..StreetConfig::default() }, None);
+        let making = |flip: bool, depth: bool| Making {
+            augment: Augment { flip, jitter: false, sensor: false },
+            depth,
+            ..Making::default()
+        };
+        let of = |flip: bool| batch_of_step(&street, making(flip, true), 4, 0, 0).unwrap();
+        let (plain, mixed) = (of(false), of(true));
+        assert!(batch_of_step(&street, making(false, false), 4, 0, 0).unwrap().depth.is_none());
+        let (plain_depth, mixed_depth) = (plain.depth.unwrap(), mixed.depth.unwrap());
+        assert_eq!(plain_depth.shape().dims(), [4, 96, 320, 1]);
+        let (pictures, each) = (plain.pyramid[0].data(), 96 * 320);
+        for (i, &sample) in samples_of_step(street.len(), 4, 0, 0).iter().enumerate() {
+            let truth = street.depth(sample).unwrap().unwrap().metres;
+            let far: Vec<f32> = truth.iter().map(|&m| if m > 0.0 { m } else { f32::INFINITY }).collect();
+            assert_eq!(plain_depth.data()[i * each..][..each], far);
+            let mirrored = pictures[3 * i * each..][..3 * each] != mixed.pyramid[0].data()[3 * i * each..][..3 * each];
+            let expected = if mirrored { crate::eval::metrics::mirror(&far, 320) } else { far };
+            assert_eq!(mixed_depth.data()[i * each..][..each], expected);
+        }
+    }
+
+    #[test]
+    fn a_sensor_changes_what_the_networks_see_and_not_what_the_loss_compares() {
+        let street = Street::render(&StreetConfig { sequences: 1, frames: 6, ..StreetConfig::default() }, None);
+        let of = |sensor: bool| batch_of_step(&street, Augment { flip: true, jitter: false, sensor }, 1, 0, 0).unwrap();
+        let (plain, sensed) = (of(false), of(true));
+        assert!(plain.pyramid[0].same_bits(&sensed.pyramid[0]) && plain.sources[1].same_bits(&sensed.sources[1]));
+        assert!(!plain.target.same_bits(&sensed.target) && sensed.target.same_bits(&of(true).target));
     }
 
     #[test]

@@ -51,7 +51,21 @@ pub fn open(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) +
             format!("{} samples a batch, but the data holds {}: make it smaller", config.batch, data.train.len());
         return Err(Error::setting("batch", message));
     }
+    if config.loss.depth_supervision > 0.0 && !knows_depth(data.train.as_ref())? {
+        let message = "no frame that is trained on has ground-truth depth: set it to 0, or add depth maps";
+        return Err(Error::setting("loss.depth_supervision", message));
+    }
     Ok(data)
+}
+
+/// Whether a sample has ground-truth depth. The others learn without.
+fn knows_depth(data: &dyn DataSource) -> Result<bool> {
+    for sample in 0..data.len() {
+        if data.depth(sample)?.is_some() {
+            return Ok(true);
+        }
+    }
+    Ok(false)
 }
 
 /// The bytes of pictures that are held in memory while a run goes on: all of the street's, none of a folder's.
