@@ -37,6 +37,8 @@ pub enum Stream {
     Order(u64),
     /// Mirroring and colour jitter of a step's batch.
     Augmentation(u64),
+    /// The photometric changes of a step's batch.
+    Photometric(u64),
     /// The pool of numbers that ties of the auto-mask are broken with.
     TiePool,
     /// Which of them a step takes.
@@ -74,6 +76,7 @@ impl Stream {
             Stream::RotationDropout => each(5, 0) - 1,
             Stream::Rotations(step) => each(5, step),
             Stream::KeptRotations(step) => each(6, step),
+            Stream::Photometric(step) => each(7, step),
         }
     }
 }

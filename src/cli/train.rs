@@ -8,7 +8,7 @@ use std::time::Instant;
 use parallax::data::apart::neighbours;
 use parallax::monovit::{Preset, Setup};
 use parallax::train::cost::check_memory;
-use parallax::train::data::{self, STREET};
+use parallax::train::data::{self, is_rendered};
 use parallax::train::freeze::frozen;
 use parallax::train::layers::Layers;
 use parallax::train::recipe::{RunConfig, STEPS};
@@ -270,7 +270,7 @@ fn create(args: &Args) -> Result<(Run, RunData)> {
         }
     }
     frozen(&start.params, &config.freeze)?;
-    if config.data != STREET {
+    if !is_rendered(&config.data) {
         config.data = args.film.folder(Path::new(&config.data))?.to_string_lossy().into_owned();
     }
     let folder = args.out.clone().unwrap_or_else(|| next_free("runs"));
@@ -381,7 +381,7 @@ impl Args {
 
 /// A path that means the same from any folder.
 fn absolute(data: &str) -> String {
-    if data == STREET {
+    if is_rendered(data) {
         return data.to_owned();
     }
     std::path::absolute(data).map_or_else(|_| data.to_owned(), |p| p.to_string_lossy().into_owned())

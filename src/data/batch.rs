@@ -13,6 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use super::DataSource;
 use super::augment::{Jitter, flip};
+use super::photometric::{Changes, Photometric};
 use super::resize::lanczos;
 use super::stereo::{Baseline, Sources};
 use crate::camera::Intrinsics;
@@ -28,11 +29,14 @@ pub struct Augment {
     pub flip: bool,
     /// Change its colours with probability 1/2: the networks see the changed images, the loss the plain ones.
     pub jitter: bool,
+    /// Change them as other cameras and other weather do; the loss sees the plain ones here, too.
+    #[serde(skip_serializing_if = "Photometric::is_none")]
+    pub photometric: Photometric,
 }
 
 impl Default for Augment {
     fn default() -> Self {
-        Augment { flip: true, jitter: true }
+        Augment { flip: true, jitter: true, photometric: Photometric::default() }
     }
 }
 
@@ -45,6 +49,8 @@ pub struct Making {
     pub sources: Sources,
     /// The unit of the distance between two cameras.
     pub baseline: Baseline,
+    /// Whether batches hold the targets' depth as it is known.
+    pub depth: bool,
 }
 
 impl From<Augment> for Making {
@@ -69,6 +75,8 @@ pub struct Batch {
     /// The x of the shift from each sample's camera to the other one, if targets are compared with its frames: points
     /// move by it, in the unit of depth. Mirrored with the pictures.
     pub shifts: Option<Vec<f64>>,
+    /// The known depth of the targets in metres, `[B, h, w, 1]`, if it is learnt from.
+    pub depth: Option<Tensor<f32>>,
     /// fx, fy, cx, cy of each sample in pixels.
     pub intrinsics: Vec<[f64; 4]>,
 }
@@ -77,7 +85,7 @@ impl Batch {
     /// Targets and their neighbours in time, which the networks see as they are.
     pub fn in_time(pyramid: Vec<Tensor<f32>>, neighbours: [Tensor<f32>; 2], intrinsics: Vec<[f64; 4]>) -> Self {
         let (target, sources) = (pyramid[0].clone(), neighbours.to_vec());
-        Batch { pyramid, sources, target, neighbours: Some(neighbours), shifts: None, intrinsics }
+        Batch { pyramid, sources, target, neighbours: Some(neighbours), shifts: None, depth: None, intrinsics }
     }
 
     /// The sources at 1/2, 1/4, 1/8 of their size, made like the target's pyramid: for each scale all sources,
@@ -278,24 +286,42 @@ fn assemble(
     step: u64,
     skip: Option<&SkipList>,
 ) -> Result<Batch> {
-    let Making { augment, sources, baseline } = making;
+    let Making { augment, sources, baseline, depth } = making;
     let samples = samples_of_step(data.len(), batch, seed, step);
     let mut random = Random::of(seed, Stream::Augmentation(step));
+    let mut photometric = Random::of(seed, Stream::Photometric(step));
     let mut stacks = Stacks::default();
     for sample in samples {
         let (mirrored, jitter) = (random.coin() && augment.flip, Jitter::draw(random.chacha()));
         let jitter = jitter.filter(|_| augment.jitter);
+        let changes = (!augment.photometric.is_none()).then(|| augment.photometric.draw(photometric.chacha()));
         let (sample, frames) = match skip {
             Some(skip) => skip.read(data, sample, sources)?,
             None => (sample, Frames::read(data, sample, sources)?),
         };
+        if depth {
+            stacks.depth.extend(known_depth(data, sample, mirrored)?);
+        }
         let frames = if mirrored { frames.mirrored() } else { frames };
         let (w, h) = frames.target.dimensions();
         let camera = if mirrored { data.mirrored_intrinsics(sample, w as usize) } else { data.intrinsics(sample) };
         stacks.intrinsics.push(in_pixels(camera, w as usize, h as usize));
-        stacks.add(frames, jitter.as_ref(), baseline);
+        stacks.add(frames, jitter.as_ref(), changes, baseline)?;
     }
     Ok(stacks.batch())
+}
+
+/// The depth of a sample in metres, row after row, mirrored or not.
+fn known_depth(data: &dyn DataSource, sample: usize, mirrored: bool) -> Result<Vec<f32>> {
+    let unknown = || {
+        let message = format!("{}: its depth is not known at every pixel; rendered streets can be learnt from so", data.name(sample));
+        Error::setting("depth_supervision", message)
+    };
+    let mut depth = data.whole_depth(sample)?.ok_or_else(unknown)?;
+    if mirrored {
+        depth.metres.chunks_exact_mut(depth.width).for_each(<[f32]>::reverse);
+    }
+    Ok(depth.metres)
 }
 
 /// The images of a batch while it grows.
@@ -308,12 +334,25 @@ struct Stacks {
     other: Vec<Arc<RgbImage>>,
     shifts: Vec<f64>,
     intrinsics: Vec<[f64; 4]>,
+    depth: Vec<f32>,
 }
 
 impl Stacks {
-    fn add(&mut self, frames: Frames, jitter: Option<&Jitter>, baseline: Baseline) {
-        let seen = |image: &Arc<RgbImage>| jitter.map_or_else(|| image.clone(), |j| Arc::new(j.apply(image)));
-        self.target.push(seen(&frames.target));
+    fn add(
+        &mut self,
+        frames: Frames,
+        jitter: Option<&Jitter>,
+        changes: Option<Changes>,
+        baseline: Baseline,
+    ) -> Result<()> {
+        let seen = |image: &Arc<RgbImage>, frame: u64| -> Result<Arc<RgbImage>> {
+            let jittered = jitter.map_or_else(|| image.clone(), |j| Arc::new(j.apply(image)));
+            Ok(match changes {
+                Some(changes) => Arc::new(changes.apply(&jittered, frame)?),
+                None => jittered,
+            })
+        };
+        self.target.push(seen(&frames.target, 0)?);
         let mut smaller = frames.target;
         for (scale, pyramid) in self.pyramids.iter_mut().enumerate() {
             if scale > 0 {
@@ -322,24 +361,28 @@ impl Stacks {
             pyramid.push(smaller.clone());
         }
         for (i, image) in frames.neighbours.into_iter().flatten().enumerate() {
-            self.neighbours[i].push(seen(&image));
+            self.neighbours[i].push(seen(&image, 1 + i as u64)?);
             self.plain_neighbours[i].push(image);
         }
         if let Some((image, metres)) = frames.other {
             self.other.push(image);
             self.shifts.push(baseline.shift(metres));
         }
+        Ok(())
     }
 
     fn batch(self) -> Batch {
         let tensor = |images: Vec<Arc<RgbImage>>| to_tensor(&images.iter().map(Arc::as_ref).collect::<Vec<_>>());
         let sources = self.plain_neighbours.into_iter().chain([self.other]).filter(|images| !images.is_empty());
+        let (batch, size) = (self.target.len(), self.target.first().map_or((0, 0), |image| image.dimensions()));
+        let shape = [batch, size.1 as usize, size.0 as usize, 1];
         Batch {
             sources: sources.map(tensor).collect(),
             pyramid: self.pyramids.map(tensor).into(),
             target: tensor(self.target),
             neighbours: (!self.neighbours[0].is_empty()).then(|| self.neighbours.map(tensor)),
             shifts: (!self.shifts.is_empty()).then_some(self.shifts),
+            depth: (!self.depth.is_empty()).then(|| Tensor::from_vec(shape, self.depth)),
             intrinsics: self.intrinsics,
         }
     }

@@ -13,6 +13,7 @@ pub mod frames;
 pub mod inputs;
 
 pub mod kitti;
+pub mod photometric;
 pub mod prepared;
 pub mod pyramid;
 pub mod resize;
@@ -87,6 +88,15 @@ pub trait DataSource: Send + Sync {
 
     /// Ground-truth depth of the target frame at its own size, where there is one.
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>>;
+
+    /// The depth of the target frame at the size the networks see, known at every pixel, in metres; `None` where it is not,
+    /// as of anything recorded. Sky is at the far end of what is rendered.
+    ///
+    /// # Errors
+    /// As [`depth`](DataSource::depth).
+    fn whole_depth(&self, _sample: usize) -> Result<Option<DepthMap>> {
+        Ok(None)
+    }
 
     /// Where the other camera of a stereo pair stands: the x of the shift that maps points of the sample's camera to
     /// points of the other one, in metres. Minus the baseline if the other one stands to the right; `None` if there is none.
@@ -229,6 +239,9 @@ impl DataSource for Subset {
     }
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {
         self.data.depth(self.samples[sample])
+    }
+    fn whole_depth(&self, sample: usize) -> Result<Option<DepthMap>> {
+        self.data.whole_depth(self.samples[sample])
     }
     fn other_camera_at(&self, sample: usize) -> Option<f64> {
         self.data.other_camera_at(self.samples[sample])

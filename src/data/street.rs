@@ -7,7 +7,7 @@ use image::RgbImage;
 use super::{DataSource, Place, no_second_camera};
 use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
-use crate::street::Street;
+use crate::street::{FAR, Street};
 use crate::{Error, Result};
 
 impl DataSource for Street {
@@ -32,8 +32,8 @@ impl DataSource for Street {
         }
     }
 
-    fn intrinsics(&self, _sample: usize) -> Intrinsics {
-        self.config().intrinsics
+    fn intrinsics(&self, sample: usize) -> Intrinsics {
+        Street::intrinsics(self, self.locate(sample).0)
     }
 
     fn place(&self, sample: usize) -> Place {
@@ -55,5 +55,12 @@ impl DataSource for Street {
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {
         let (sequence, frame) = self.locate(sample);
         Ok(Some(self.frame_depth(sequence, frame)))
+    }
+
+    fn whole_depth(&self, sample: usize) -> Result<Option<DepthMap>> {
+        let (sequence, frame) = self.locate(sample);
+        let mut depth = self.frame_depth(sequence, frame);
+        depth.metres.iter_mut().filter(|m| **m <= 0.0).for_each(|m| *m = FAR);
+        Ok(Some(depth))
     }
 }

@@ -9,10 +9,25 @@ use crate::data::apart::refuse_shared;
 use crate::data::aside::set_aside;
 use crate::data::{DataSource, Opening, Subset, open_folder};
 use crate::error::{Error, Result};
-use crate::street::{Street, StreetConfig};
+use crate::street::{Street, StreetConfig, WorldKind};
 
 /// The name of the embedded street as a data set. A folder of that name is `./street`.
 pub const STREET: &str = "street";
+
+/// The name of the wide world of rendered roads as a data set.
+pub const STREET_2: &str = "street-2";
+
+/// Whether a run's data are rendered by the program: `street`, which is `street-1`, or `street-2`.
+pub fn is_rendered(data: &str) -> bool {
+    [STREET, STREET_1, STREET_2].contains(&data)
+}
+
+/// The embedded street by its full name.
+const STREET_1: &str = "street-1";
+
+/// Sequences of `street-2` (training, validation, test), and frames of each.
+const WIDE_SEQUENCES: [usize; 3] = [1200, 16, 24];
+const WIDE_FRAMES: usize = 4;
 
 /// Sequences of the embedded street: training, validation, test. Many short drives: a street more teaches more than a
 /// few metres more of the same.
@@ -30,7 +45,7 @@ const APART: u64 = 1_000_000;
 /// # Errors
 /// If the data cannot be read, one frame is in two splits, or there are fewer samples than a batch holds.
 pub fn open(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + Sync)) -> Result<RunData> {
-    let data = if config.data == STREET { street(config, progress) } else { folder(config)? };
+    let data = if is_rendered(&config.data) { street(config, progress) } else { folder(config)? };
     if data.train.len() < config.batch {
         let message =
             format!("{} samples a batch, but the data holds {}: make it smaller", config.batch, data.train.len());
@@ -42,19 +57,33 @@ pub fn open(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) +
 /// The bytes of pictures that are held in memory while a run goes on: all of the street's, none of a folder's.
 pub(super) fn bytes_held(config: &RunConfig) -> f64 {
     let cameras = if config.sources.other_camera() { 2 } else { 1 };
-    let frames = if config.data == STREET { cameras * SEQUENCES.iter().sum::<usize>() * FRAMES } else { 0 };
+    let frames = match config.data.as_str() {
+        STREET | STREET_1 => cameras * SEQUENCES.iter().sum::<usize>() * FRAMES,
+        STREET_2 => cameras * WIDE_SEQUENCES.iter().sum::<usize>() * WIDE_FRAMES,
+        _ => 0,
+    };
     3.0 * (frames * config.height * config.width) as f64
 }
 
 fn street(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + Sync)) -> RunData {
     let RunConfig { height, width, seed, .. } = *config;
+    let wide = config.data == STREET_2;
     let street = |what: &'static str, sequences: usize, seed: u64| {
         let baseline = if config.sources.other_camera() { BASELINE } else { 0.0 };
-        let settings =
-            StreetConfig { height, width, sequences, frames: FRAMES, seed, baseline, ..StreetConfig::default() };
+        let usual = StreetConfig { height, width, sequences, frames: FRAMES, seed, baseline, ..StreetConfig::default() };
+        let settings = match wide {
+            true => StreetConfig {
+                frames: WIDE_FRAMES,
+                world: WorldKind::Street2,
+                own_lenses: true,
+                moving_cars: true,
+                ..usual
+            },
+            false => usual,
+        };
         Arc::new(Street::render(&settings, Some(&|done, all| progress(what, done, all))))
     };
-    let [train, validation, test] = SEQUENCES;
+    let [train, validation, test] = if wide { WIDE_SEQUENCES } else { SEQUENCES };
     RunData {
         train: street("street", train, seed),
         validation: street("validation", validation, seed.wrapping_add(APART)),

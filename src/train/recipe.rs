@@ -12,6 +12,7 @@ use super::rotations::{RotationPlan, Rotations};
 pub use super::schedule::{RateDecay, RateSchedule};
 use crate::data::batch::{Augment, Making};
 use crate::data::camera::Camera;
+use crate::data::photometric::Photometric;
 use crate::data::stereo::{Baseline, Sources};
 use crate::error::{Error, Result};
 use crate::monovit::loss::LossConfig;
@@ -105,6 +106,8 @@ pub struct Plan {
     pub optim: OptimConfig,
     /// The factor on the learning rates, step by step.
     pub schedule: Schedule,
+    /// The weight of the error of log depth.
+    pub depth_supervision: f64,
     /// The loss.
     pub loss: LossConfig,
     /// The number of steps before auto-masking sets in.
@@ -221,6 +224,10 @@ pub struct RunConfig {
     pub ablation: Ablation,
     /// Augmentation.
     pub augment: Augment,
+    /// The weight of the error of log depth where the depth of every pixel is known: of rendered streets. With 0, the default,
+    /// training is self-supervised alone.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub depth_supervision: f64,
     /// The loss.
     pub loss: LossConfig,
     /// Known rotations for the pose network, before training and at its beginning; not where training starts from given
@@ -228,6 +235,10 @@ pub struct RunConfig {
     pub rotations: Rotations,
     /// The optimiser.
     pub optim: OptimConfig,
+}
+
+fn is_zero(x: &f64) -> bool {
+    *x == 0.0
 }
 
 /// The usual share, for configurations from before there was one.
@@ -275,7 +286,8 @@ impl RunConfig {
             freeze: Vec::new(),
             pose_first: 0.0,
             ablation: Ablation::default(),
-            augment: Augment { flip: true, jitter: false },
+            augment: Augment { flip: true, jitter: false, photometric: Photometric::default() },
+            depth_supervision: 0.0,
             // Of the 3,800 steps of the default run these shares are 300, 500 before training and 600, and 100.
             auto_mask_delay: 0.0789,
             loss: LossConfig { consistent_grid: true, ..LossConfig::default() },
@@ -346,6 +358,7 @@ impl RunConfig {
         Plan {
             optim: self.optim,
             schedule: self.optim.schedule.over(self.steps, self.epoch.unwrap_or(self.steps)),
+            depth_supervision: self.depth_supervision,
             loss: self.loss,
             auto_mask_after: steps_of(self.auto_mask_delay, self.steps),
             accumulate: self.accumulate,
@@ -364,7 +377,7 @@ impl RunConfig {
 
     /// How its samples become batches.
     pub fn making(&self) -> Making {
-        Making { augment: self.augment, sources: self.sources, baseline: self.baseline }
+        Making { augment: self.augment, sources: self.sources, baseline: self.baseline, depth: self.depth_supervision > 0.0 }
     }
 
     /// Notes how many steps a pass over so many training samples takes, and how many steps the epochs are, if those are what
@@ -405,6 +418,9 @@ impl RunConfig {
         check_share("pose_first", self.pose_first)?;
         check_share("auto_mask_delay", self.auto_mask_delay)?;
         check_share("pairs_first", self.pairs_first)?;
+        let weight = self.depth_supervision;
+        check("depth_supervision", weight, weight >= 0.0 && weight.is_finite(), "a weight from 0")?;
+        self.augment.photometric.check()?;
         self.loss.check()?;
         self.rotations.check()?;
         self.optim.check()?;

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::freeze::{Frozen, frozen};
 use super::recipe::Plan;
 use super::rotations::Lesson;
+use super::supervision::log_depth_error;
 use super::vitals::{Signs, Vitals};
 use crate::data::batch::Batch;
 use crate::error::{Error, Result};
@@ -36,6 +37,9 @@ pub struct StepReport {
     pub smoothness: f64,
     /// The share of pixels that auto-masking leaves in.
     pub auto_mask: f64,
+    /// The error of log depth, where depth is learnt from.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub depth_error: Option<f64>,
     /// The learning rates: encoder, decoder, pose networks.
     pub learning_rates: [f64; 3],
     /// The norm of all gradients, before clipping.
@@ -59,6 +63,7 @@ impl StepReport {
             unwarped: mean(|r| r.unwarped),
             smoothness: mean(|r| r.smoothness),
             auto_mask: mean(|r| r.auto_mask),
+            depth_error: of.iter().all(|r| r.depth_error.is_some()).then(|| mean(|r| r.depth_error.unwrap_or(0.0))),
             vitals: Vitals {
                 disparity: mean(|r| r.vitals.disparity),
                 disparity_spread: mean(|r| r.vitals.disparity_spread),
@@ -102,6 +107,8 @@ struct Forward {
     found: Loss<f32>,
     /// At full size, `[B, H, W, 1]`.
     disparity: Tensor<f32>,
+    /// The error of log depth, where it is learnt from.
+    supervised: Option<Var<f32>>,
     /// Of each source, `[B, 3, 4]`.
     transforms: Vec<Tensor<f32>>,
 }
@@ -245,9 +252,10 @@ impl Trainer {
         } else {
             loss_of(&disparities, &transforms, &all)
         };
+        let supervised = batch.depth.as_ref().map(|known| log_depth_error(&disparities[0], known, &config));
         let disparity = disparities[0].value().clone();
         let transforms = transforms.iter().map(|t| t.value().clone()).collect();
-        Forward { c, found, disparity, transforms }
+        Forward { c, found, disparity, supervised, transforms }
     }
 
     /// One step on one batch: forward, backward, AdamW.
@@ -328,7 +336,7 @@ impl Trainer {
     fn pass(&self, pass: u64, batch: &Batch) -> Result<Pass> {
         let step = self.adamw.steps;
         let tape = Tape::new();
-        let Forward { c, found, disparity, transforms } = self.forward(&tape, batch, pass);
+        let Forward { c, found, disparity, supervised, transforms } = self.forward(&tape, batch, pass);
         let total = found.total.value().item() as f64;
         if !total.is_finite() {
             return Err(self.explain(step + 1, batch, pass));
@@ -336,6 +344,10 @@ impl Trainer {
         let objective = match self.plan.rotations.term([step, pass], &self.model, &c, batch, self.plan.seed) {
             Some(term) => &found.total + term,
             None => found.total.clone(),
+        };
+        let objective = match &supervised {
+            Some(error) => objective + error.affine(self.plan.depth_supervision, 0.0),
+            None => objective,
         };
         let mut all = objective.backward();
         let gradients = c.gradients(&mut all);
@@ -348,13 +360,14 @@ impl Trainer {
             unwarped: found.unwarped,
             smoothness: found.smoothness,
             auto_mask: found.auto_mask,
+            depth_error: supervised.as_ref().map(|error| error.value().item() as f64),
             vitals: profile::phase("vitals", || {
                 let signs = Signs { disparity: &disparity, transforms: &transforms, intrinsics: &batch.intrinsics };
                 Vitals::of(&signs, &self.plan.loss)
             }),
             ..StepReport::default()
         };
-        profile::phase("freeing", move || drop((all, objective, found, disparity, transforms, tape)));
+        profile::phase("freeing", move || drop((all, objective, found, supervised, disparity, transforms, tape)));
         Ok(Pass { gradients, moved, report })
     }
 

@@ -66,7 +66,7 @@ const DENSE: Evaluation = Evaluation { protocol: Protocol::Dense, scale: Scale::
 impl Run {
     /// A fixed set of batches without augmentation; none if a frame cannot be read, which is told.
     pub(super) fn validation_batches(&self, data: &RunData, tell: &mut impl FnMut(Event)) -> Vec<Batch> {
-        let plain = Making { augment: Augment { flip: false, jitter: false }, ..self.config.making() };
+        let plain = Making { augment: Augment { flip: false, jitter: false, photometric: Default::default() }, depth: false, ..self.config.making() };
         let size = self.config.batch.min(data.validation.len());
         let count = data.validation.len().checked_div(size).unwrap_or(0).min(10) as u64;
         let samples = data.validation.as_ref();
