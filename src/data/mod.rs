@@ -11,7 +11,6 @@ pub mod check;
 pub mod film;
 pub mod frames;
 pub mod inputs;
-pub mod joined;
 
 pub mod kitti;
 pub mod prepared;

@@ -32,8 +32,8 @@ impl DataSource for Street {
         }
     }
 
-    fn intrinsics(&self, _sample: usize) -> Intrinsics {
-        self.config().intrinsics
+    fn intrinsics(&self, sample: usize) -> Intrinsics {
+        Street::intrinsics(self, self.locate(sample).0)
     }
 
     fn place(&self, sample: usize) -> Place {

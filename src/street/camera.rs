@@ -2,6 +2,7 @@
 
 use super::StreetConfig;
 use super::draw::Draw;
+use crate::camera::Intrinsics;
 
 /// Camera pose: camera-to-world, in metres; x right, y down, z forward in both frames.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -119,9 +120,9 @@ pub(crate) struct View {
 }
 
 impl View {
-    /// The camera of a configuration at `pose`.
-    pub(crate) fn new(config: &StreetConfig, pose: Pose) -> Self {
-        let (w, h, k) = (config.width as f64, config.height as f64, config.intrinsics);
+    /// A camera at `pose`, its pictures of the configuration's size.
+    pub(crate) fn new(config: &StreetConfig, k: Intrinsics, pose: Pose) -> Self {
+        let (w, h) = (config.width as f64, config.height as f64);
         let (focal, centre) = ([k.fx * w, k.fy * h], [k.cx * w, k.cy * h]);
         View { pose, width: config.width, height: config.height, focal, centre }
     }

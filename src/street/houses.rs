@@ -61,8 +61,13 @@ pub(crate) fn across(world: &mut World, draw: &mut Draw, range: [f64; 2]) {
     }
 }
 
+/// The walls of a district.
+pub(crate) fn district(draw: &mut Draw) -> &'static [[f64; 3]] {
+    draw.pick(&DISTRICTS)
+}
+
 /// The look of one house.
-fn facade(draw: &mut Draw, walls: &[[f64; 3]], height: f64, brick: bool, shops: f64) -> Facade {
+pub(crate) fn facade(draw: &mut Draw, walls: &[[f64; 3]], height: f64, brick: bool, shops: f64) -> Facade {
     let wall = draw.pick(walls);
     let sign =
         draw.pick(&[[0.45, 0.12, 0.12], [0.12, 0.26, 0.42], [0.14, 0.34, 0.24], [0.55, 0.42, 0.16], [0.2, 0.2, 0.22]]);
@@ -92,7 +97,7 @@ fn facade(draw: &mut Draw, walls: &[[f64; 3]], height: f64, brick: bool, shops: 
 }
 
 /// A house with its front `front` metres from the middle, from `z` on, `width` along the street.
-fn house(world: &mut World, draw: &mut Draw, side: f64, front: f64, z: f64, width: f64, facade: Facade) {
+pub(crate) fn house(world: &mut World, draw: &mut Draw, side: f64, front: f64, z: f64, width: f64, facade: Facade) {
     let height = facade.height as f64;
     let eaves = GROUND_Y - height;
     let (x0, x1) = beside(side, front, front + DEEP);

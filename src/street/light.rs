@@ -64,6 +64,17 @@ impl Light {
         }
     }
 
+    /// This light as a camera that exposes for the road takes it: a sky without much colour, shade that is dark. `glare`
+    /// from 0 (as it is) to 1 (white).
+    pub(crate) fn glaring(mut self, glare: f32) -> Self {
+        let white = [1.0, 1.0, 1.0];
+        self.zenith = mix(self.zenith, white, glare);
+        self.horizon = mix(self.horizon, white, 0.8 * glare);
+        self.ambient *= 1.0 - 0.35 * glare;
+        self.haze *= 1.0 - 0.5 * glare;
+        self
+    }
+
     /// Notes a house of `height` between `z0` and `z1` on a side (0 left, 1 right).
     pub(crate) fn house(&mut self, side: usize, z0: f64, z1: f64, height: f64) {
         let first = (z0 + BEHIND).max(0.0) as usize;

@@ -202,7 +202,8 @@ impl<'a> Shader<'a> {
         let world: [f32; 3] = std::array::from_fn(|k| self.eye[k] + at[k]);
         let local = std::array::from_fn(|k| at[k] - seen.origin[k]);
         let point = Point { world, local, footprint, axis, normal };
-        let colour = seen.solid.material.colour(&point, seen.solid.seed);
+        let (material, seed, wear) = (&seen.solid.material, seen.solid.seed, self.scene.world.wear);
+        let colour = if wear < 1.0 { material.worn(&point, seed, wear) } else { material.colour(&point, seed) };
         let mut factor = light.on(world, normal);
         if axis == 1 && world[0].abs() < 6.5 && seen.solid.shape.bounds().is_none_or(|(_, high)| high[1] > 1.9) {
             factor *= self.scene.world.open(world, self.scene.frame);

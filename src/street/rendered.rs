@@ -11,9 +11,24 @@ use super::build::street;
 use super::camera::{Pose, View, drive, winding};
 use super::draw::Draw;
 use super::render::Scene;
+use super::wide::{camera, ride, wide_street};
 use super::world::World;
 use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
+
+/// The worlds that sequences are rendered from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum WorldKind {
+    /// The embedded street, which figures are compared on.
+    #[default]
+    #[serde(rename = "street-1")]
+    Street1,
+    /// Roads of many kinds, each with a camera of its own around the configuration's; for networks that are to see real
+    /// pictures.
+    #[serde(rename = "street-2")]
+    Street2,
+}
 
 /// Settings of the rendered street: size, number of sequences and frames, seed, camera.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -29,6 +44,10 @@ pub struct StreetConfig {
     pub frames: usize,
     /// Everything follows from it.
     pub seed: u64,
+    /// Which world.
+    pub world: WorldKind,
+    /// Whether every sequence of `street-2` has a lens of its own around `intrinsics`.
+    pub own_lenses: bool,
     /// Whether other cars drive too: self-supervision takes a static world, so this is off by default.
     pub moving_cars: bool,
     /// The camera.
@@ -45,6 +64,8 @@ impl Default for StreetConfig {
             sequences: 40,
             frames: 24,
             seed: 0,
+            world: WorldKind::Street1,
+            own_lenses: false,
             moving_cars: false,
             intrinsics: Intrinsics::KITTI,
             baseline: 0.0,
@@ -56,6 +77,7 @@ impl Default for StreetConfig {
 struct Sequence {
     world: World,
     poses: Vec<Pose>,
+    intrinsics: Intrinsics,
     images: Vec<Arc<RgbImage>>,
     /// Frames of the second camera; empty without one.
     right: Vec<Arc<RgbImage>>,
@@ -69,13 +91,17 @@ pub struct Street {
 
 /// What a stream of random numbers is for.
 const WORLD: u64 = 1;
-pub(super) const PATH: u64 = 2;
+const PATH: u64 = 2;
+const CAMERA: u64 = 3;
 
 impl Street {
     /// Renders all sequences, on rayon's threads; the pictures are the same for any number of them. `progress` gets the
     /// number of frames done and of all, from any thread.
     pub fn render(config: &StreetConfig, progress: Option<&(dyn Fn(usize, usize) + Sync)>) -> Street {
         let sequence = |k: usize, world: &World| {
+            if config.world == WorldKind::Street2 {
+                return ride(&mut Draw::new(config.seed, k as u64, PATH), config.frames, world.lane, world.bend);
+            }
             drive(
                 &mut Draw::new(config.seed, k as u64, PATH),
                 config.frames,
@@ -119,7 +145,7 @@ impl Street {
     }
 
     /// Renders every sequence along the path that `path` gives for its number and its world.
-    pub(super) fn film(
+    fn film(
         config: &StreetConfig,
         path: &(dyn Fn(usize, &World) -> Vec<Pose> + Sync),
         progress: Option<&(dyn Fn(usize, usize) + Sync)>,
@@ -128,10 +154,20 @@ impl Street {
         let total = config.sequences * config.frames * cameras;
         let done = AtomicUsize::new(0);
         let sequence = |k: usize| {
-            let world = street(&mut Draw::new(config.seed, k as u64, WORLD), config.frames, config.moving_cars);
+            let draw = &mut Draw::new(config.seed, k as u64, WORLD);
+            let (world, intrinsics) = match config.world {
+                WorldKind::Street1 => (street(draw, config.frames, config.moving_cars), config.intrinsics),
+                WorldKind::Street2 => (
+                    wide_street(draw, config.frames, config.moving_cars),
+                    match config.own_lenses {
+                        true => camera(&mut Draw::new(config.seed, k as u64, CAMERA), config.intrinsics),
+                        false => config.intrinsics,
+                    },
+                ),
+            };
             let poses = path(k, &world);
             let image = |frame: usize, pose: Pose| {
-                let image = Scene::new(&world, View::new(config, pose), frame).image();
+                let image = Scene::new(&world, View::new(config, intrinsics, pose), frame).image();
                 let done = done.fetch_add(1, Ordering::Relaxed) + 1;
                 if let Some(progress) = progress {
                     progress(done, total);
@@ -141,7 +177,7 @@ impl Street {
             let images = poses.par_iter().enumerate().map(|(frame, pose)| image(frame, *pose)).collect();
             let right = poses.par_iter().enumerate().map(|(frame, pose)| image(frame, pose.beside(config.baseline)));
             let right = if config.baseline == 0.0 { Vec::new() } else { right.collect() };
-            Sequence { world, poses, images, right }
+            Sequence { world, poses, intrinsics, images, right }
         };
         Street { config: config.clone(), sequences: (0..config.sequences).into_par_iter().map(sequence).collect() }
     }
@@ -149,6 +185,11 @@ impl Street {
     /// Settings with which it was rendered.
     pub fn config(&self) -> &StreetConfig {
         &self.config
+    }
+
+    /// The camera of a sequence. Panics if there is no such sequence.
+    pub fn intrinsics(&self, sequence: usize) -> Intrinsics {
+        self.sequences[sequence].intrinsics
     }
 
     /// The camera's poses in a sequence, one a frame. Panics if there is no such sequence.
@@ -169,8 +210,8 @@ impl Street {
 
     /// The depth of a frame at the pixels' centres: camera z in metres, 0 for the sky. Panics if there is none such.
     pub fn frame_depth(&self, sequence: usize, frame: usize) -> DepthMap {
-        let Sequence { world, poses, .. } = &self.sequences[sequence];
-        Scene::new(world, View::new(&self.config, poses[frame]), frame).depth()
+        let Sequence { world, poses, intrinsics, .. } = &self.sequences[sequence];
+        Scene::new(world, View::new(&self.config, *intrinsics, poses[frame]), frame).depth()
     }
 
     /// How many samples there are: frames that have both neighbours.

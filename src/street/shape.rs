@@ -68,6 +68,22 @@ impl Shape {
         }
     }
 
+    /// The same solid `by` metres farther to the right.
+    pub(crate) fn sideways(self, by: f64) -> Shape {
+        let right = |[x, y, z]: [f64; 3]| [x + by, y, z];
+        match self {
+            Shape::Ground { .. } => self,
+            Shape::Box { low, high } => Shape::Box { low: right(low), high: right(high) },
+            Shape::Frustum { top_y, top, bottom_y, bottom } => {
+                let across = |r: [f64; 4]| [r[0] + by, r[1] + by, r[2], r[3]];
+                Shape::Frustum { top_y, top: across(top), bottom_y, bottom: across(bottom) }
+            }
+            Shape::Pole { x, z, radius, top_y, bottom_y } => Shape::Pole { x: x + by, z, radius, top_y, bottom_y },
+            Shape::Wheel { x, y, z, radius } => Shape::Wheel { x: x.map(|x| x + by), y, z, radius },
+            Shape::Crown { centre, radii, seed } => Shape::Crown { centre: right(centre), radii, seed },
+        }
+    }
+
     /// The solid as the camera at `eye` sees it.
     pub(crate) fn place(&self, eye: [f64; 3]) -> Placed {
         let relative = |p: [f64; 3]| -> [f32; 3] { std::array::from_fn(|k| (p[k] - eye[k]) as f32) };
@@ -401,7 +417,7 @@ mod tests {
 
     fn view() -> View {
         let config = StreetConfig { height: 48, width: 160, ..StreetConfig::default() };
-        View::new(&config, Pose::new([0.2, 0.0, 1.0], 0.05, 0.01))
+        View::new(&config, config.intrinsics, Pose::new([0.2, 0.0, 1.0], 0.05, 0.01))
     }
 
     fn shapes() -> Vec<Shape> {

@@ -3,7 +3,7 @@
 
 use super::light::GROUND;
 use super::texture::{Colour, Patch, band, fade, floor, hash, hash_unit, mix, noise3, pulse, pulse_centred, scale};
-use super::weather::weathered;
+use super::weather::{faintly_weathered, weathered};
 
 /// A point of a surface, with all that its look depends on.
 pub(crate) struct Point {
@@ -21,7 +21,7 @@ pub(crate) struct Point {
 
 impl Point {
     /// The two axes of the texture: along the street or across it, and up (or along).
-    fn patch(&self) -> Patch {
+    pub(crate) fn patch(&self) -> Patch {
         let (a, b) = match self.axis {
             0 => (2, 1),
             1 => (0, 2),
@@ -31,7 +31,7 @@ impl Point {
     }
 
     /// Height above the ground, in metres.
-    fn height(&self) -> f32 {
+    pub(crate) fn height(&self) -> f32 {
         GROUND - self.world[1]
     }
 }
@@ -108,6 +108,8 @@ pub(crate) enum Material {
     Leaves(Colour),
     Masonry(Colour),
     Sign(Colour),
+    /// A surface of the wide world.
+    Wide(super::wide::Look),
 }
 
 impl Material {
@@ -118,6 +120,16 @@ impl Material {
             // Leaves are patches all over.
             Material::Leaves(_) => clean,
             _ => weathered(clean, &p.patch(), seed.wrapping_add(900)),
+        }
+    }
+
+    /// The colour at a point of the wide world, where dust lies as thick as `wear` says: 0 for none, 1 for all of
+    /// [`weathered`].
+    pub(crate) fn worn(&self, p: &Point, seed: u32, wear: f32) -> Colour {
+        let clean = self.clean(p, seed);
+        match self {
+            Material::Leaves(_) | Material::Wide(_) => clean,
+            _ => faintly_weathered(clean, &p.patch(), seed.wrapping_add(900), wear),
         }
     }
 
@@ -134,6 +146,7 @@ impl Material {
                 scale(*colour, 1.0 + p.patch().octaves(&[(1.3, 0.35), (4.0, 0.35), (11.0, 0.3)], seed))
             }
             Material::Leaves(colour) => leaves(p, *colour, seed),
+            Material::Wide(look) => look.colour(p, seed),
             Material::Masonry(colour) => masonry(&p.patch(), *colour, seed),
             Material::Sign(colour) => {
                 let patch = p.patch();
@@ -147,7 +160,7 @@ impl Material {
 const WHITE: Colour = [0.86, 0.86, 0.84];
 
 impl Road {
-    fn colour(&self, p: &Point, seed: u32) -> Colour {
+    pub(crate) fn colour(&self, p: &Point, seed: u32) -> Colour {
         let patch = p.patch();
         let Patch { u: x, v: z, du: fx, dv: fz } = patch;
         // Grain at several scales; along the street it is drawn out, as wear is, and outlives the grazing footprint.

@@ -16,3 +16,8 @@ pub(super) fn weathered(colour: Colour, patch: &Patch, seed: u32) -> Colour {
     let worn = scale(colour, (1.0 - 0.9 * wear).max(0.1));
     mix(worn, DUST, (0.15 + 0.8 * wear).clamp(0.0, 0.75))
 }
+
+/// A colour under a share `wear` of that dust.
+pub(super) fn faintly_weathered(colour: Colour, patch: &Patch, seed: u32, wear: f32) -> Colour {
+    if wear <= 0.0 { colour } else { mix(colour, weathered(colour, patch, seed), wear) }
+}

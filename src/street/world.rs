@@ -28,6 +28,10 @@ pub(crate) struct World {
     /// How far the camera may stray from there, in metres.
     pub(crate) room: f64,
     pub(crate) light: Light,
+    /// How fast the road bends to the right, in 1/m.
+    pub(crate) bend: f64,
+    /// How thick dust lies: 1 in the embedded street, less in the wide world.
+    pub(crate) wear: f32,
     pub(crate) solids: Vec<Solid>,
     /// The footprints of what is parked, by metres from -[`BEHIND`], left and right: at most two reach into a metre.
     shade: [Vec<[Option<Footprint>; 2]>; 2],
@@ -61,7 +65,16 @@ pub(crate) fn vary(draw: &mut Draw, colour: [f64; 3], by: f64, tone: f64) -> Col
 impl World {
     /// A street with nothing in it.
     pub(crate) fn empty(lane: f64, room: f64, light: Light) -> Self {
-        World { lane, room, light, solids: Vec::new(), shade: [Vec::new(), Vec::new()], movers: Vec::new() }
+        World {
+            lane,
+            room,
+            light,
+            bend: 0.0,
+            wear: 1.0,
+            solids: Vec::new(),
+            shade: [Vec::new(), Vec::new()],
+            movers: Vec::new(),
+        }
     }
 
     /// The footprints of what is parked.
@@ -75,6 +88,14 @@ impl World {
         // 24 bits, so that materials may count up from it.
         let seed = draw.bits() >> 8;
         self.solids.push(Solid { shape, material, origin, seed, speed: 0.0 });
+    }
+
+    /// Moves the solids from the number `first` on by `by` metres to the right.
+    pub(crate) fn shift(&mut self, first: usize, by: f64) {
+        for solid in &mut self.solids[first..] {
+            solid.shape = solid.shape.sideways(by);
+            solid.origin[0] += by;
+        }
     }
 
     /// Notes the shade below a parked or a moving car.

@@ -7,27 +7,31 @@ use super::recipe::RunConfig;
 use super::run::RunData;
 use crate::data::apart::refuse_shared;
 use crate::data::aside::set_aside;
-use crate::data::joined::Joined;
 use crate::data::{DataSource, Opening, Subset, open_folder};
 use crate::error::{Error, Result};
-use crate::street::{Street, StreetConfig, varied};
+use crate::street::{Street, StreetConfig, WorldKind};
 
 /// The name of the embedded street as a data set. A folder of that name is `./street`.
 pub const STREET: &str = "street";
 
-/// The name of the street that many cameras see.
+/// The name of the wide world of rendered roads as a data set.
 pub const STREET_2: &str = "street-2";
 
-/// Whether a data set is rendered by the program, and not a folder.
+/// Whether a run's data are rendered by the program: `street`, which is `street-1`, or `street-2`.
 pub fn is_rendered(data: &str) -> bool {
-    [STREET, STREET_2].contains(&data)
+    [STREET, STREET_1, STREET_2].contains(&data)
 }
+
+/// The embedded street by its full name.
+const STREET_1: &str = "street-1";
+
+/// Sequences of `street-2` (training, validation, test), and frames of each.
+const WIDE_SEQUENCES: [usize; 3] = [1200, 16, 24];
+const WIDE_FRAMES: usize = 4;
 
 /// Sequences of the embedded street: training, validation, test. Many short drives: a street more teaches more than a
 /// few metres more of the same.
 const SEQUENCES: [usize; 3] = [144, 12, 24];
-/// Those of the street that many cameras see.
-const SEQUENCES_2: [usize; 3] = [480, 24, 24];
 /// Frames of each.
 const FRAMES: usize = 10;
 /// Where a second camera stands, if one is asked for: metres to the right, like KITTI's.
@@ -41,11 +45,7 @@ const APART: u64 = 1_000_000;
 /// # Errors
 /// If the data cannot be read, one frame is in two splits, or there are fewer samples than a batch holds.
 pub fn open(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + Sync)) -> Result<RunData> {
-    let data = match &config.data[..] {
-        STREET => street(config, progress),
-        STREET_2 => street_2(config, progress),
-        _ => folder(config)?,
-    };
+    let data = if is_rendered(&config.data) { street(config, progress) } else { folder(config)? };
     if data.train.len() < config.batch {
         let message =
             format!("{} samples a batch, but the data holds {}: make it smaller", config.batch, data.train.len());
@@ -71,46 +71,38 @@ fn knows_depth(data: &dyn DataSource) -> Result<bool> {
 /// The bytes of pictures that are held in memory while a run goes on: all of the street's, none of a folder's.
 pub(super) fn bytes_held(config: &RunConfig) -> f64 {
     let cameras = if config.sources.other_camera() { 2 } else { 1 };
-    let sequences = match &config.data[..] {
-        STREET => SEQUENCES.iter().sum(),
-        STREET_2 => SEQUENCES_2.iter().sum(),
-        _ => 0usize,
+    let frames = match config.data.as_str() {
+        STREET | STREET_1 => cameras * SEQUENCES.iter().sum::<usize>() * FRAMES,
+        STREET_2 => cameras * WIDE_SEQUENCES.iter().sum::<usize>() * WIDE_FRAMES,
+        _ => 0,
     };
-    let frames = cameras * sequences * FRAMES;
     3.0 * (frames * config.height * config.width) as f64
 }
 
 fn street(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + Sync)) -> RunData {
     let RunConfig { height, width, seed, .. } = *config;
+    let wide = config.data == STREET_2;
     let street = |what: &'static str, sequences: usize, seed: u64| {
         let baseline = if config.sources.other_camera() { BASELINE } else { 0.0 };
-        let settings =
+        let usual =
             StreetConfig { height, width, sequences, frames: FRAMES, seed, baseline, ..StreetConfig::default() };
+        let settings = match wide {
+            true => StreetConfig {
+                frames: WIDE_FRAMES,
+                world: WorldKind::Street2,
+                own_lenses: true,
+                moving_cars: true,
+                ..usual
+            },
+            false => usual,
+        };
         Arc::new(Street::render(&settings, Some(&|done, all| progress(what, done, all))))
     };
-    let [train, validation, test] = SEQUENCES;
+    let [train, validation, test] = if wide { WIDE_SEQUENCES } else { SEQUENCES };
     RunData {
         train: street("street", train, seed),
         validation: street("validation", validation, seed.wrapping_add(APART)),
         test: Some(street("test", test, seed.wrapping_add(2 * APART))),
-    }
-}
-
-/// The street that many cameras see.
-fn street_2(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + Sync)) -> RunData {
-    let RunConfig { height, width, seed, .. } = *config;
-    let baseline = if config.sources.other_camera() { BASELINE } else { 0.0 };
-    let streets = |what: &'static str, sequences: usize, seed: u64| -> Arc<dyn DataSource> {
-        let settings =
-            StreetConfig { height, width, sequences, frames: FRAMES, seed, baseline, ..StreetConfig::default() };
-        let streets = varied(&settings, Some(&|done, all| progress(what, done, all)));
-        Arc::new(Joined::new(streets.into_iter().map(|street| Arc::new(street) as Arc<dyn DataSource>).collect()))
-    };
-    let [train, validation, test] = SEQUENCES_2;
-    RunData {
-        train: streets("street-2", train, seed),
-        validation: streets("validation", validation, seed.wrapping_add(APART)),
-        test: Some(streets("test", test, seed.wrapping_add(2 * APART))),
     }
 }
 

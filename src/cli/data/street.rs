@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use parallax::camera::Intrinsics;
-use parallax::street::{Street, StreetConfig, export};
+use parallax::street::{Street, StreetConfig, WorldKind, export};
 use parallax::{Error, Result};
 
 use crate::cli::progress::Progress;
@@ -41,6 +41,9 @@ pub struct Args {
     /// holds its lane and hardly turns].
     #[arg(long, value_name = "DEGREES", conflicts_with = "moving_cars")]
     turn: Option<f64>,
+    /// Roads of many kinds, as `train --data street-2` sees them, but of one camera.
+    #[arg(long, conflicts_with = "turn")]
+    wide: bool,
     /// Add moving cars.
     #[arg(long)]
     moving_cars: bool,
@@ -89,6 +92,8 @@ pub fn run(a: Args) -> Result<()> {
         sequences: a.sequences,
         frames: a.frames,
         seed: a.seed,
+        world: if a.wide { WorldKind::Street2 } else { WorldKind::Street1 },
+        own_lenses: false,
         moving_cars: a.moving_cars,
         baseline,
         intrinsics: a.intrinsics.map_or(Intrinsics::KITTI, |k| Intrinsics {
