@@ -7,6 +7,8 @@ use parallax::weights;
 use parallax::weights::{Form, Need, Sources};
 use parallax::{Error, Result};
 
+mod ship;
+
 #[derive(clap::Args)]
 pub struct Args {
     /// Weights: files (.pth, .safetensors, .npz), a folder with encoder.pth, depth.pth, ..., or a run's folder.
@@ -32,12 +34,25 @@ pub struct Args {
     /// Replace what stands at OUT.
     #[arg(long)]
     force: bool,
-    /// Print one JSON object: what was matched, missing, unexpected.
+    /// Make the file of weights that lies inside the program: IN is a run's folder, OUT assets/shipped.safetensors.
+    ///
+    /// Numbers are rounded to bfloat16; the metadata say what the run was trained on, its recipe and steps, the version
+    /// and the SIMD level of this program (to be run by the one that trained), the licence, and how depth becomes
+    /// metres, which is measured on rendered streets. Says how much rounding changes depth.
+    #[arg(long, conflicts_with_all = ["allow_partial", "height", "width", "averaged"])]
+    ship: bool,
+    /// What the shipped weights were trained on, in words [default: as the run's configuration says].
+    #[arg(long, value_name = "WORDS", requires = "ship")]
+    world: Option<String>,
+    /// Print one JSON object: what was matched, missing, unexpected; with --ship what was measured and written.
     #[arg(long)]
     json: bool,
 }
 
 pub fn run(args: Args) -> Result<()> {
+    if args.ship {
+        return ship::run(&args);
+    }
     for (name, size) in [("--height", args.height), ("--width", args.width)] {
         size.map_or(Ok(()), |size| check_size(name, size))?;
     }
