@@ -158,7 +158,6 @@ fn the_truth_as_another_programs_disparities_is_perfect() {
     fails(&flags, 1, &["disps.npy", "[frames, height, width]", "[192, 96]"]);
     write_npy_shaped(&file, &vec![-1.0; 64 * 96], &[1, 64, 96]).expect("written");
     fails(&flags, 1, &[&format!("{DRIVE} 1 l"), "row 0, column 0 is -1"]);
-    fails(&["eval", "--data", text(street)], 2, &["--weights"]);
     fails(&[&flags[..], &["--flip"]].concat(), 2, &["--flip"]);
 }
 

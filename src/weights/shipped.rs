@@ -181,3 +181,14 @@ pub fn ship(weights: &Weights, origin: &Origin, path: &Path) -> Result<()> {
     metadata.insert(KEY.into(), text);
     safetensors::write_in(path, &tensors, metadata, Numbers::Bf16)
 }
+
+#[cfg(all(test, not(feature = "shipped-weights")))]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn without_the_feature_the_error_says_what_to_do() {
+        let error = open().unwrap_err().to_string();
+        assert!(error.contains("--features shipped-weights") && error.contains("run's folder"), "{error}");
+    }
+}
