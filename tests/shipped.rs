@@ -123,11 +123,11 @@ fn a_picture_alone_gives_a_map_in_metres() {
 #[test]
 fn every_command_takes_them_and_a_folder_of_that_name_is_told_apart() {
     let (place, _) = place();
-    let street = ["data", "street", "--out", "street", "--sequences", "1", "--frames", "4"];
+    let street = ["data", "street", "--out", "drive", "--sequences", "1", "--frames", "4"];
     said(place.path(), &street);
-    let [out, _] = said(place.path(), &["eval", "--data", "street", "--weights", "shipped", "--bootstrap", "0"]);
+    let [out, _] = said(place.path(), &["eval", "--data", "drive", "--weights", "shipped", "--bootstrap", "0"]);
     assert!(out.contains("weights   shipped"), "{out}");
-    let [default, _] = said(place.path(), &["eval", "--data", "street", "--bootstrap", "0"]);
+    let [default, _] = said(place.path(), &["eval", "--data", "drive", "--bootstrap", "0"]);
     assert_eq!(default, out, "they are what is used without --weights");
     said(place.path(), &["attention", "photo.jpg", "--at", "200,60", "--out", "look"]);
     assert!(place.path().join("look/photo_attention.png").is_file());
