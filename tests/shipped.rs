@@ -25,7 +25,7 @@ fn shipped() -> Weights {
 
 fn street(weights: &Weights, seed: u64, intrinsics: Intrinsics) -> Street {
     let (height, width) = (weights.setup.height, weights.setup.width);
-    let config = StreetConfig { height, width, sequences: 6, frames: 4, seed, intrinsics, ..StreetConfig::default() };
+    let config = StreetConfig { height, width, sequences: 4, frames: 3, seed, intrinsics, ..StreetConfig::default() };
     Street::render(&config, None)
 }
 
@@ -66,7 +66,7 @@ fn its_maps_of_rendered_streets_are_far_better_than_the_mean_depth_map_and_in_me
             baseline.metrics
         );
         let off = metres.factor_for(camera) / found.ratio_median.expect("a factor");
-        assert!((off - 1.0).abs() < 0.15, "{camera:?}: metres are off by {off}");
+        assert!((off - 1.0).abs() < 0.25, "{camera:?}: metres are off by {off}");
     }
 }
 
@@ -158,7 +158,7 @@ fn a_run_becomes_a_file_to_ship() {
     let (place, _) = place();
     let run = run_of(place.path(), Preset::Pico);
     let run = run.to_str().expect("UTF-8");
-    let ship = ["convert", run, "new.safetensors", "--ship", "--world", "nothing at all"];
+    let ship = ["convert", run, "new.safetensors", "--ship", "--streets", "1", "--world", "nothing at all"];
     let [out, _] = said(place.path(), &[&ship[..], &["--json"]].concat());
     let json: serde_json::Value = serde_json::from_str(&out).expect("JSON");
     let [mean, largest] = ["rounding_mean", "rounding_largest"].map(|name| json[name].as_f64().expect("a number"));

@@ -44,6 +44,9 @@ pub struct Args {
     /// What the shipped weights were trained on, in words [default: as the run's configuration says].
     #[arg(long, value_name = "WORDS", requires = "ship")]
     world: Option<String>,
+    /// With --ship: on how many rendered streets metres are measured, with each of ten cameras.
+    #[arg(long, value_name = "N", requires = "ship", default_value_t = 10, value_parser = clap::value_parser!(u16).range(1..))]
+    streets: u16,
     /// Print one JSON object: what was matched, missing, unexpected; with --ship what was measured and written.
     #[arg(long)]
     json: bool,

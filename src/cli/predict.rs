@@ -127,6 +127,7 @@ Pictures of any size:
   320x96), and its map is stretched back. It is best at what looks as a road does there: the horizon
   near the middle. Pictures much wider or taller than that, or of a few pixels, are done and named.
 
+What is written:
   NAME_disp.png is there to be looked at: inverse depth in magma, near is bright, from its smallest
   value to its 95th percentile. All other results are numbers, at the picture's own size.
 
@@ -134,10 +135,10 @@ Scale:
   Shipped weights speak in metres for a camera that hangs 1.65 m above the road, as their training's
   did; at twice the height true depths are twice as large. The view across is taken to be 81.5 degrees:
   --fov or --intrinsics correct the metres for another lens, by exponents that were measured on
-  rendered streets (of a lens twice as long, what looks the same is further away). --height or --width
-  other than the network's own end that: depths have no unit then.
-  Other weights that learnt from one moving camera know depth up to a factor. --camera-height finds it on
-  the road: every pixel of the prediction has a tangent plane; where that is level to 5 degrees it is
+  rendered streets (what looks the same through a longer lens is further away). With another --height
+  or --width than the network's own, depths have no unit.
+  Other weights that learnt from one moving camera know depth up to a factor. --camera-height finds it
+  on the road: every pixel of the prediction has a tangent plane; where that is level to 5 degrees it is
   ground, and the median distance of these planes from the camera is the camera's height h in the
   prediction's unit. Depths are multiplied by METRES / h. The camera has to be held level and to see
   the road: a picture of which less than a hundredth is level fails. --json says the factor of each

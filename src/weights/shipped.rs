@@ -112,7 +112,7 @@ impl Origin {
         if let Some((field, number)) = numbers.iter().find(|(_, x)| !(x.is_finite() && *x > 0.0)) {
             return Err(Error::setting(*field, format!("{number} is not a number above 0")));
         }
-        // A picture never looks nearer through a longer lens, nor by more than a power of it.
+        // By geometry they lie between 0 and 1. A network may be odd, but hardly that odd.
         for (field, exponent) in [("metres.by_width", by_width), ("metres.by_height", by_height)] {
             if !(-2.0..=2.0).contains(&exponent) {
                 return Err(Error::setting(field, format!("{exponent} is not a number from -2 to 2")));

@@ -14,9 +14,6 @@ use serde::Serialize;
 
 use super::Args;
 
-/// How many streets each measurement is made on.
-const SEQUENCES: usize = 10;
-
 /// What `--json` says.
 #[derive(Serialize)]
 struct Shipped<'a> {
@@ -54,11 +51,12 @@ pub fn run(args: &Args) -> Result<()> {
     let mut rounded = load_from(&sources, Need::All, false)?;
     rounded.round_to_bf16();
 
-    note!("measuring the metre on {SEQUENCES} rendered streets for each of ten cameras");
+    let sequences = usize::from(args.streets);
+    note!("measuring metres on {sequences} rendered streets, with each of ten cameras");
     let exact = Predictor::new(&weights.model, &weights.params, &weights.setup);
     let predictor = Predictor::new(&rounded.model, &rounded.params, &rounded.setup);
-    let calibration = calibrate(&predictor, SEQUENCES)?;
-    let street = streets(&predictor, calibration.metres.camera, SEQUENCES);
+    let calibration = calibrate(&predictor, sequences)?;
+    let street = streets(&predictor, calibration.metres.camera, sequences);
     let before = on_streets(&exact, &street)?;
     let rounding = moved(&exact, &predictor, &street)?;
 
