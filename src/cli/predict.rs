@@ -347,7 +347,7 @@ fn predict(args: &Args, predictor: &Predictor, job: Job, scaling: &Scaling) -> R
 const FEW: usize = 32;
 
 /// How many times wider or taller than the network's pictures a picture is stretched without a word.
-const STRETCHED: f64 = 4.0;
+const STRETCHED: f64 = 5.0;
 
 /// Why little is to be expected of a picture of this width and height, seen at the size `seen`.
 fn doubt((w, h): (usize, usize), seen: (usize, usize)) -> Option<String> {
