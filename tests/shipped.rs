@@ -25,7 +25,7 @@ fn shipped() -> Weights {
 
 fn street(weights: &Weights, seed: u64, intrinsics: Intrinsics) -> Street {
     let (height, width) = (weights.setup.height, weights.setup.width);
-    let config = StreetConfig { height, width, sequences: 4, frames: 3, seed, intrinsics, ..StreetConfig::default() };
+    let config = StreetConfig { height, width, sequences: 2, frames: 3, seed, intrinsics, ..StreetConfig::default() };
     Street::render(&config, None)
 }
 
@@ -123,17 +123,20 @@ fn a_picture_alone_gives_a_map_in_metres() {
 #[test]
 fn every_command_takes_them_and_a_folder_of_that_name_is_told_apart() {
     let (place, _) = place();
-    let street = ["data", "street", "--out", "drive", "--sequences", "1", "--frames", "4"];
+    let street = ["data", "street", "--out", "drive", "--sequences", "1", "--frames", "3"];
     said(place.path(), &street);
-    let [out, _] = said(place.path(), &["eval", "--data", "drive", "--weights", "shipped", "--bootstrap", "0"]);
+    let [out, _] = said(place.path(), &["eval", "--data", "drive", "--bootstrap", "0"]);
     assert!(out.contains("weights   shipped"), "{out}");
-    let [default, _] = said(place.path(), &["eval", "--data", "drive", "--bootstrap", "0"]);
-    assert_eq!(default, out, "they are what is used without --weights");
     said(place.path(), &["attention", "photo.jpg", "--at", "200,60", "--out", "look"]);
     assert!(place.path().join("look/photo_attention.png").is_file());
     let [config, _] = said(place.path(), &["train", "--init", "shipped", "--print-config"]);
     assert!(config.contains("init = [\"shipped\"]"), "{config}");
-    said(place.path(), &["convert", "shipped", "copy.npz"]);
+    said(place.path(), &["convert", "shipped", "copy.safetensors"]);
+    said(place.path(), &["convert", "shipped", "other.safetensors", "--width", "256"]);
+    for (copy, unit) in [("copy.safetensors", "metres"), ("other.safetensors", "relative")] {
+        let [json, _] = said(place.path(), &["predict", "photo.jpg", "--weights", copy, "--json"]);
+        assert!(json.contains(&format!("\"unit\":\"{unit}\"")), "{copy}: {json}");
+    }
 
     fs::create_dir(place.path().join("shipped")).expect("made");
     let [_, err] = said(place.path(), &["predict", "photo.jpg"]);

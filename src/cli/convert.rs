@@ -62,6 +62,10 @@ pub fn run(args: Args) -> Result<()> {
     let form = Form::of(&args.out)?;
     let open = if args.averaged { Sources::open_averaged } else { Sources::open };
     let mut weights = weights::load_from(&open(&args.inputs)?, Need::Any, args.allow_partial)?;
+    if args.height.is_some() || args.width.is_some() {
+        // How depth becomes metres was measured at the size that they had.
+        weights.origin = None;
+    }
     weights.setup.height = args.height.unwrap_or(weights.setup.height);
     weights.setup.width = args.width.unwrap_or(weights.setup.width);
     let outputs = weights::outputs(&weights, &args.out, form);

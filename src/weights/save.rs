@@ -96,7 +96,10 @@ pub fn save(weights: &Weights, path: &Path, form: Form) -> Result<()> {
     };
     match form {
         Form::Safetensors => {
-            let metadata = if with_encoder { weights.setup.metadata()? } else { HashMap::new() };
+            let mut metadata = if with_encoder { weights.setup.metadata()? } else { HashMap::new() };
+            if let (true, Some(origin)) = (with_encoder, &weights.origin) {
+                metadata.extend(origin.metadata()?);
+            }
             safetensors::write(path, &tensors(weights), metadata)
         }
         Form::Npz => {

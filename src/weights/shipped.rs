@@ -121,6 +121,12 @@ impl Origin {
         Ok(())
     }
 
+    /// The metadata of a file of weights that come from there.
+    pub(super) fn metadata(&self) -> Result<HashMap<String, String>> {
+        let text = serde_json::to_string(self).map_err(|e| Error::Failed(format!("the origin as JSON: {e}")))?;
+        Ok(HashMap::from([(KEY.into(), text)]))
+    }
+
     /// What the metadata of a file of weights says, if anything.
     ///
     /// # Errors
@@ -176,9 +182,8 @@ pub fn ship(weights: &Weights, origin: &Origin, path: &Path) -> Result<()> {
         );
         return Err(Error::Failed(message));
     }
-    let text = serde_json::to_string(origin).map_err(|e| Error::Failed(format!("the origin as JSON: {e}")))?;
     let mut metadata = weights.setup.metadata()?;
-    metadata.insert(KEY.into(), text);
+    metadata.extend(origin.metadata()?);
     safetensors::write_in(path, &tensors, metadata, Numbers::Bf16)
 }
 
