@@ -13,6 +13,7 @@ use parallax::formats::png::write_png;
 use parallax::report::overlay::{Overlay, mark};
 use parallax::tensor::{Tensor, profile};
 use parallax::train::run::load_weights;
+use parallax::weights::SHIPPED;
 use parallax::{Error, Result};
 use serde::Serialize;
 
@@ -20,8 +21,8 @@ use super::sheet::{Panel, sheet};
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Weights, or a run's folder (its best weights).
-    #[arg(long, value_name = "FILE|RUN")]
+    /// Weights, or a run's folder (its best weights). `shipped`: those inside the program.
+    #[arg(long, value_name = "FILE|RUN", default_value = SHIPPED)]
     weights: PathBuf,
     /// A picture (PNG, JPEG).
     #[arg(value_name = "IMAGE")]

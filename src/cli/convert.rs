@@ -7,6 +7,8 @@ use parallax::weights;
 use parallax::weights::{Form, Need, Sources};
 use parallax::{Error, Result};
 
+mod ship;
+
 #[derive(clap::Args)]
 pub struct Args {
     /// Weights: files (.pth, .safetensors, .npz), a folder with encoder.pth, depth.pth, ..., or a run's folder.
@@ -32,18 +34,38 @@ pub struct Args {
     /// Replace what stands at OUT.
     #[arg(long)]
     force: bool,
-    /// Print one JSON object: what was matched, missing, unexpected.
+    /// Make the file of weights that lies inside the program: IN is a run's folder, OUT assets/shipped.safetensors.
+    ///
+    /// Numbers are rounded to bfloat16; the metadata say what the run was trained on, its recipe and steps, the version
+    /// and the SIMD level of this program (to be run by the one that trained), the licence, and how depth becomes
+    /// metres, which is measured on rendered streets. Says how much rounding changes depth.
+    #[arg(long, conflicts_with_all = ["allow_partial", "height", "width", "averaged"])]
+    ship: bool,
+    /// What the shipped weights were trained on, in words [default: as the run's configuration says].
+    #[arg(long, value_name = "WORDS", requires = "ship")]
+    world: Option<String>,
+    /// With --ship: on how many rendered streets metres are measured, with each of ten cameras.
+    #[arg(long, value_name = "N", requires = "ship", default_value_t = 10, value_parser = clap::value_parser!(u16).range(1..))]
+    streets: u16,
+    /// Print one JSON object: what was matched, missing, unexpected; with --ship what was measured and written.
     #[arg(long)]
     json: bool,
 }
 
 pub fn run(args: Args) -> Result<()> {
+    if args.ship {
+        return ship::run(&args);
+    }
     for (name, size) in [("--height", args.height), ("--width", args.width)] {
         size.map_or(Ok(()), |size| check_size(name, size))?;
     }
     let form = Form::of(&args.out)?;
     let open = if args.averaged { Sources::open_averaged } else { Sources::open };
     let mut weights = weights::load_from(&open(&args.inputs)?, Need::Any, args.allow_partial)?;
+    if args.height.is_some() || args.width.is_some() {
+        // How depth becomes metres was measured at the size that they had.
+        weights.origin = None;
+    }
     weights.setup.height = args.height.unwrap_or(weights.setup.height);
     weights.setup.width = args.width.unwrap_or(weights.setup.width);
     let outputs = weights::outputs(&weights, &args.out, form);

@@ -29,9 +29,10 @@ mod source;
 
 #[derive(clap::Args)]
 #[command(mut_arg("weights", |weights| {
-    weights.required(false).required_unless_present_any(["disparities", "predictions", "poses"]).num_args(1..).help(
+    weights.num_args(1..).help(
         "Weights: a run's folder (its best weights), a file (.safetensors, .pth, .npz), or a folder with encoder.pth, \
-         depth.pth, ...; several networks (A B C) are set beside each other, the others less the first",
+         depth.pth, ...; `shipped`: those inside the program; several networks (A B C) are set beside each other, the \
+         others less the first",
     )
 }))]
 pub struct Args {

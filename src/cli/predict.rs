@@ -6,11 +6,10 @@ use std::time::Instant;
 use image::RgbImage;
 use parallax::camera::Intrinsics;
 use parallax::data::film::{is_film, make_film};
-use parallax::data::inputs::{Input, find_pictures};
+use parallax::data::inputs::find_pictures;
 use parallax::data::resize::lanczos;
 use parallax::depth::InverseDepth;
-use parallax::eval::camera_height::find_ground;
-use parallax::eval::metrics::{STEREO_SCALE, median};
+use parallax::eval::metrics::median;
 use parallax::eval::odometry::Odometry;
 use parallax::eval::predictor::Predictor;
 use parallax::formats::atomic::check_writable;
@@ -20,7 +19,7 @@ use parallax::formats::picture::read_picture;
 use parallax::formats::ply::write_point_cloud;
 use parallax::formats::png::write_png;
 use parallax::report::colormap::disparity_to_image;
-use parallax::weights::{Need, Weights};
+use parallax::weights::{Need, Origin, Weights};
 use parallax::{Error, Result};
 use serde::Serialize;
 
@@ -30,8 +29,10 @@ use super::sizes::Numbers;
 
 mod outputs;
 mod paths;
+mod scale;
 
 use outputs::{Job, Outputs, jobs};
+use scale::Scaling;
 
 #[derive(clap::Args)]
 #[command(after_long_help = AFTER)]
@@ -55,13 +56,14 @@ pub struct Args {
     /// A picture's results bear its name; those of a folder lie as its pictures do. With several inputs
     /// each folder's results go into a folder of its own name. Two pictures whose results would be the
     /// same file, or that would overwrite a picture, are an error before any work.
-    #[arg(long, value_name = "DIR", verbatim_doc_comment)]
+    #[arg(long, value_name = "DIR", default_value = "depth", verbatim_doc_comment)]
     out: PathBuf,
     /// Print one JSON object: what was made of every picture, and what failed.
     ///
-    /// weights, height, width (of the network), pictures: [{input, outputs: {disparity, depth,
-    /// inverse_depth, points}, width, height, factor, median_depth, seconds}], failed: [{input, error}],
-    /// seconds.
+    /// weights, trained_on (words, or null), height, width (of the network), unit ("metres" or
+    /// "relative"), pictures: [{input, outputs: {disparity, depth, inverse_depth, points}, width, height,
+    /// factor, median_depth, doubt (words, or null), seconds}], failed: [{input, error}], seconds (since
+    /// the program began).
     #[arg(long, verbatim_doc_comment)]
     json: bool,
     /// Also NAME_depth.png: 16-bit grey, depth * 256, as KITTI stores it.
@@ -90,7 +92,7 @@ pub struct Args {
     /// Numbers in which products are taken; bf16 where the processor has AVX-512 BF16.
     #[arg(long, value_enum, default_value = "f32", help_heading = "Network")]
     precision: Numbers,
-    /// Factor that depths are multiplied by [default: 1].
+    /// Factor that depths are multiplied by [default: what makes metres, where the weights say it; otherwise 1].
     #[arg(long, value_name = "FACTOR", group = "unit", help_heading = "Scale (one of)", value_parser = above_zero)]
     scale: Option<f64>,
     /// Metres for weights from stereo pairs whose baseline of 0.54 m was called 0.1: --scale 5.4.
@@ -100,23 +102,43 @@ pub struct Args {
     #[arg(long, value_name = "METRES", group = "unit", help_heading = "Scale (one of)", value_parser = above_zero)]
     camera_height: Option<f64>,
     /// Focal lengths and principal point, in pixels of the pictures [default: from --fov].
-    #[arg(long, value_name = "FX,FY,CX,CY", group = "camera", help_heading = "Camera (for --ply, --camera-height)")]
+    #[arg(long, value_name = "FX,FY,CX,CY", group = "camera", help_heading = CAMERA)]
     #[arg(value_parser = super::pinhole)]
     intrinsics: Option<[f64; 4]>,
     /// Horizontal field of view in degrees, for square pixels around the middle [default: 81.5, KITTI's].
-    #[arg(long, value_name = "DEGREES", group = "camera", help_heading = "Camera (for --ply, --camera-height)")]
+    #[arg(long, value_name = "DEGREES", group = "camera", help_heading = CAMERA)]
     #[arg(value_parser = field_of_view)]
     fov: Option<f64>,
 }
 
+/// Where the camera counts.
+const CAMERA: &str = "Camera (for metres, --ply, --camera-height)";
+
 const AFTER: &str = "\
+Weights:
+  Without --weights, those inside the program. They learnt depth from nothing but streets that this
+  program renders, by watching; the first line of the output says which network they are and what
+  it was trained on. They know a road seen from a car, with houses, trees and parked cars at its
+  sides. A picture of anything else (a room, a face, a lawn) gets a map all the same: what the
+  network makes of it, which may be nonsense. Nothing checks whether a picture shows a street.
+
+Pictures of any size:
+  The network sees every picture stretched to its own size, whatever the aspect (the shipped one:
+  320x96), and its map is stretched back. It is best at what looks as a road does there: the horizon
+  near the middle. Pictures much wider or taller than that, or of a few pixels, are done and named.
+
 What is written:
   NAME_disp.png is there to be looked at: inverse depth in magma, near is bright, from its smallest
   value to its 95th percentile. All other results are numbers, at the picture's own size.
 
 Scale:
-  Weights that learnt from one moving camera know depth up to a factor. --camera-height finds it on
-  the road: every pixel of the prediction has a tangent plane; where that is level to 5 degrees it is
+  Shipped weights speak in metres for a camera that hangs 1.65 m above the road, as their training's
+  did; at twice the height true depths are twice as large. The view across is taken to be 81.5 degrees:
+  --fov or --intrinsics correct the metres for another lens, by exponents that were measured on
+  rendered streets (what looks the same through a longer lens is further away). With another --height
+  or --width than the network's own, depths have no unit.
+  Other weights that learnt from one moving camera know depth up to a factor. --camera-height finds it
+  on the road: every pixel of the prediction has a tangent plane; where that is level to 5 degrees it is
   ground, and the median distance of these planes from the camera is the camera's height h in the
   prediction's unit. Depths are multiplied by METRES / h. The camera has to be held level and to see
   the road: a picture of which less than a hundredth is level fails. --json says the factor of each
@@ -124,13 +146,15 @@ Scale:
 
 Camera:
   Without --intrinsics or --fov it is KITTI's: a focal length of 0.58 of the width. With another lens
-  points lie too far to the sides or too little, and --camera-height is off by the same ratio.
+  points lie too far to the sides or too little, and metres are off.
 
 Exit status:
   0 all pictures are done; 1 something failed: what, is said on standard error, and the other
   pictures are done; 2 wrong usage.
 
 Examples:
+  parallax predict photo.jpg
+  parallax predict phone.jpg --fov 67 --depth-png --ply
   parallax predict --weights runs/1 pictures/ --out depth/
   parallax predict --weights runs/1 drive/ --out depth/ --camera-height 1.65 --ply --depth-png
   parallax predict --weights runs/1 phone.jpg --out depth/ --ply --fov 67 --flip";
@@ -149,9 +173,11 @@ fn field_of_view(text: &str) -> Result<f64, String> {
 #[derive(Serialize)]
 struct Summary {
     weights: String,
+    trained_on: Option<String>,
     /// The size at which the network saw the pictures.
     height: usize,
     width: usize,
+    unit: &'static str,
     pictures: Vec<Done>,
     failed: Vec<Failure>,
     seconds: f64,
@@ -167,6 +193,8 @@ struct Done {
     factor: f64,
     /// The median of the depths, after that.
     median_depth: f64,
+    /// Why little is to be expected of this picture.
+    doubt: Option<String>,
     seconds: f64,
 }
 
@@ -190,18 +218,24 @@ pub fn run(args: Args) -> Result<()> {
     let paths = if args.poses { paths::of(&jobs, &args.out)? } else { Vec::new() };
     let (jobs, there) = left_to_do(jobs, args.skip_existing);
     let need = if args.poses { Need::All } else { Need::Depth };
-    let Weights { model, params, setup, .. } = args.weights.load_with(need)?;
+    let Weights { model, params, setup, origin, .. } = args.weights.load_with(need)?;
+    let scaling = Scaling::new(&args, origin.as_ref());
+    scaling.tell(&args.weights, &setup, params.count(""));
     let made = !args.out.exists();
     check_writable(&args.out)?;
     let predictor = Predictor::new(&model, &params, &setup).with_precision(args.precision.checked()?)?;
-    let size = (setup.height, setup.width);
     let mut progress = Progress::new("pictures", jobs.len() as u64);
     let (mut done, mut failed) = (Vec::new(), Vec::new());
     for (i, job) in jobs.into_iter().enumerate() {
         let input = job.input.path.to_string_lossy().into_owned();
         // The rest of a folder still gets done; the exit status says that something was not.
-        match predict(&args, &predictor, job, size) {
-            Ok(picture) => done.push(picture),
+        match predict(&args, &predictor, job, &scaling) {
+            Ok(picture) => {
+                if let Some(doubt) = &picture.doubt {
+                    progress.say(&format!("{input}: {doubt}"));
+                }
+                done.push(picture);
+            }
             Err(error) => {
                 progress.say(&format!("parallax: {error}"));
                 failed.push(Failure { input, error: error.to_string() });
@@ -218,7 +252,7 @@ pub fn run(args: Args) -> Result<()> {
     }
     let odometry = Odometry::new(&model, &params, &setup);
     for path in &paths {
-        if let Err(error) = path.write(&odometry, args.factor_of_all()) {
+        if let Err(error) = path.write(&odometry, &scaling) {
             note!("parallax: {error}");
             failed.push(Failure { input: path.file.to_string_lossy().into_owned(), error: error.to_string() });
         }
@@ -230,8 +264,17 @@ pub fn run(args: Args) -> Result<()> {
     }
     let (all, failures) = (done.len() + failed.len(), failed.len());
     if args.json {
-        let (weights, seconds) = (args.weights.name(), started.elapsed().as_secs_f64());
-        super::print_json(&Summary { weights, height: size.0, width: size.1, pictures: done, failed, seconds })?;
+        let summary = Summary {
+            weights: args.weights.name(),
+            trained_on: origin.as_ref().map(Origin::in_words),
+            height: setup.height,
+            width: setup.width,
+            unit: scaling.unit(),
+            pictures: done,
+            failed,
+            seconds: started.elapsed().as_secs_f64(),
+        };
+        super::print_json(&summary)?;
     }
     // A folder that was made for nothing; if it cannot go, what matters is said already.
     if made && failures == all {
@@ -280,8 +323,9 @@ fn tell_skipped(skipped: &[PathBuf]) {
     note!("{} files are no PNG, JPEG or WebP and are passed over: {}{more}", skipped.len(), first.join(", "));
 }
 
-fn predict(args: &Args, predictor: &Predictor, job: Job, (height, width): (usize, usize)) -> Result<Done> {
+fn predict(args: &Args, predictor: &Predictor, job: Job, scaling: &Scaling) -> Result<Done> {
     let started = Instant::now();
+    let (height, width) = (predictor.setup().height, predictor.setup().width);
     let picture = read_picture(&job.input.path)?;
     let (w, h) = (picture.width() as usize, picture.height() as usize);
     let camera = args.camera(w as f64, h as f64);
@@ -290,12 +334,34 @@ fn predict(args: &Args, predictor: &Predictor, job: Job, (height, width): (usize
     if !map.is_whole() {
         return Err(Error::file(&job.input.path, predictor.why_not_finite(&seen)));
     }
-    let factor = args.factor(&job.input, &map.values, (height, width), camera)?;
+    let factor = scaling.factor(&job.input, &map.values, (height, width), camera)?;
     let median_depth = median(map.values.iter().map(|&d| factor / f64::from(d)).collect()).unwrap_or(f64::NAN);
     write(&job.outputs, &picture, &map.resized(h, w, factor), camera)?;
     let input = job.input.path.to_string_lossy().into_owned();
+    let doubt = doubt((w, h), (width, height));
     let seconds = started.elapsed().as_secs_f64();
-    Ok(Done { input, outputs: job.outputs, width: w, height: h, factor, median_depth, seconds })
+    Ok(Done { input, outputs: job.outputs, width: w, height: h, factor, median_depth, doubt, seconds })
+}
+
+/// A picture with fewer pixels on a side shows hardly anything.
+const FEW: usize = 32;
+
+/// How many times wider or taller than the network's pictures a picture is stretched without a word.
+const STRETCHED: f64 = 5.0;
+
+/// Why little is to be expected of a picture of this width and height, seen at the size `seen`.
+fn doubt((w, h): (usize, usize), seen: (usize, usize)) -> Option<String> {
+    let stretched = (w as f64 / h as f64) / (seen.0 as f64 / seen.1 as f64);
+    let to = format!("is stretched to the network's {}x{}", seen.0, seen.1);
+    if w < FEW || h < FEW {
+        Some(format!("a picture of {w}x{h} pixels {to}: too few to see a street in, expect little"))
+    } else if !(1.0 / STRETCHED..=STRETCHED).contains(&stretched) {
+        let side = if stretched > 1.0 { "wider" } else { "taller" };
+        let times = stretched.max(1.0 / stretched);
+        Some(format!("a picture of {w}x{h} {to}, and is {times:.1} times {side} than that: expect little"))
+    } else {
+        None
+    }
 }
 
 /// Writes what is wanted of a picture's inverse depth.
@@ -318,34 +384,6 @@ fn write(outputs: &Outputs, picture: &RgbImage, inverse: &InverseDepth, camera: 
     Ok(())
 }
 
-impl Args {
-    /// The camera of a picture of `width x height` pixels.
-    fn camera(&self, width: f64, height: f64) -> Intrinsics {
-        let [fx, fy, cx, cy] = self.intrinsics.unwrap_or_else(|| {
-            // Half the width over the tangent of half the view.
-            let focal = self.fov.map_or(Intrinsics::KITTI.fx, |fov| 0.5 / (fov / 2.0).to_radians().tan()) * width;
-            [focal, focal, (width - 1.0) / 2.0, (height - 1.0) / 2.0]
-        });
-        Intrinsics { fx: fx / width, fy: fy / height, cx: cx / width, cy: cy / height }
-    }
-
-    /// Factor on all depths, where pictures have no factor of their own.
-    fn factor_of_all(&self) -> f64 {
-        if self.stereo { STEREO_SCALE } else { self.scale.unwrap_or(1.0) }
-    }
-
-    /// What a picture's depths are multiplied by; `map` is its inverse depth as predicted.
-    fn factor(&self, input: &Input, map: &[f32], size: (usize, usize), camera: Intrinsics) -> Result<f64> {
-        let Some(metres) = self.camera_height else { return Ok(self.factor_of_all()) };
-        let ground = find_ground(map, size, camera).ok_or_else(|| {
-            let message = "no road was found to measure the camera's height over: give --scale instead, or the \
-                           camera's --intrinsics or --fov if it is not KITTI's";
-            Error::file(&input.path, message)
-        })?;
-        Ok(metres / ground.camera_height)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -363,51 +401,16 @@ mod tests {
         assert!(field_of_view("67").is_ok() && field_of_view("0").is_err() && field_of_view("180").is_err());
     }
 
-    #[derive(clap::Parser)]
-    struct Command {
-        #[command(flatten)]
-        args: Args,
-    }
-
-    fn args(more: &[&str]) -> Args {
-        let all = ["predict", "--weights", "w", "a.png", "--out", "o"].iter().chain(more);
-        <Command as clap::Parser>::try_parse_from(all).map(|command| command.args).unwrap()
-    }
-
     #[test]
-    fn every_flag_of_the_scale_gives_its_factor() {
-        let input = Input { path: "a.png".into(), name: "a".into() };
-        let size = (24, 80);
-        // A road: inverse depth grows with the row below the horizon. Its camera hangs half a unit above it.
-        let road: Vec<f32> =
-            (0..24 * 80).map(|i| (((i / 80) as f64 - 11.5) / (80.0 * 0.58) / 0.5).max(0.01) as f32).collect();
-        let factor = |more: &[&str]| {
-            let args = args(more);
-            args.factor(&input, &road, size, args.camera(80.0, 24.0))
-        };
-        assert_eq!(factor(&[]).unwrap(), 1.0);
-        assert_eq!(factor(&["--scale", "2.5"]).unwrap(), 2.5);
-        assert_eq!(factor(&["--stereo"]).unwrap(), 5.4);
-        let found = factor(&["--camera-height", "1.65"]).unwrap();
-        assert!((found / 3.3 - 1.0).abs() < 0.01, "{found}");
-        // With a longer lens the same rows lie nearer to the horizon: the camera hangs lower.
-        let longer = factor(&["--camera-height", "1.65", "--intrinsics", "92.8,92.8,39.5,11.5"]).unwrap();
-        assert!((longer / 6.6 - 1.0).abs() < 0.02, "{longer}");
-        let nowhere = args(&["--camera-height", "1.65"]);
-        let error = nowhere.factor(&input, &vec![0.1; 24 * 80], size, nowhere.camera(80.0, 24.0)).unwrap_err();
-        assert!(error.to_string().contains("a.png: no road"), "{error}");
-    }
-
-    #[test]
-    fn the_camera_is_kittis_unless_given() {
-        let close = |a: Intrinsics, b: Intrinsics, by: f64| {
-            let pairs = [(a.fx, b.fx), (a.fy, b.fy), (a.cx, b.cx), (a.cy, b.cy)];
-            assert!(pairs.iter().all(|(a, b)| (a / b - 1.0).abs() < by), "{a:?} {b:?}");
-        };
-        // The published constants are those of KITTI's pictures, up to half a pixel.
-        close(args(&[]).camera(1242.0, 375.0), Intrinsics::KITTI, 4e-3);
-        close(args(&["--fov", "81.5"]).camera(640.0, 480.0), args(&[]).camera(640.0, 480.0), 1e-3);
-        let given = args(&["--intrinsics", "700,710,600,170"]).camera(1000.0, 500.0);
-        close(given, Intrinsics { fx: 0.7, fy: 1.42, cx: 0.6, cy: 0.34 }, 1e-12);
+    fn little_is_said_to_be_expected_of_slits_and_specks() {
+        let seen = (320, 96);
+        for fine in [(1242, 375), (1920, 1080), (640, 480), (3024, 4032), (320, 96), (32, 32)] {
+            assert_eq!(doubt(fine, seen), None, "{fine:?}");
+        }
+        for (size, word) in
+            [((1, 1), "too few"), ((4000, 20), "too few"), ((8000, 400), "wider"), ((300, 600), "taller")]
+        {
+            assert!(doubt(size, seen).is_some_and(|doubt| doubt.contains(word)), "{size:?}");
+        }
     }
 }

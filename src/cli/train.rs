@@ -14,7 +14,7 @@ use parallax::train::layers::Layers;
 use parallax::train::recipe::{RunConfig, STEPS};
 use parallax::train::run::{Ended, Event, Run, RunData, RunMetrics};
 use parallax::train::start::Start;
-use parallax::weights::{self, preset_of};
+use parallax::weights::{self, SHIPPED, preset_of};
 use parallax::{Error, Result};
 
 use super::ablation;
@@ -101,7 +101,7 @@ pub struct Args {
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Weights of all four networks to start from: a run, a file, or a folder with encoder.pth, depth.pth, ...; several
-    /// times for several files [default: random weights].
+    /// times for several files; `shipped`: those inside the program [default: random weights].
     #[arg(long, value_name = "FILE|DIR")]
     init: Vec<PathBuf>,
     /// Weights of an MPViT that was trained on ImageNet, for the depth encoder to start from.
@@ -424,7 +424,11 @@ fn configuration(args: &Args) -> Result<RunConfig> {
         }
     }
     if !args.init.is_empty() {
-        c.init = args.init.iter().map(|p| std::path::absolute(p).unwrap_or_else(|_| p.clone())).collect();
+        let anywhere = |p: &PathBuf| match p.as_os_str() == SHIPPED {
+            true => p.clone(),
+            false => std::path::absolute(p).unwrap_or_else(|_| p.clone()),
+        };
+        c.init = args.init.iter().map(anywhere).collect();
     }
     c.allow_partial |= args.allow_partial;
     c.skip_bad_frames |= args.skip_bad_frames;

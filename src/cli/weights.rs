@@ -1,17 +1,17 @@
 //! The flags that say which weights to use, the same wherever weights are used.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use parallax::Result;
 use parallax::monovit::setup::check_size;
 use parallax::weights;
-use parallax::weights::{Need, Sources, Weights};
+use parallax::weights::{Need, SHIPPED, Sources, Weights};
 
 #[derive(Clone, clap::Args)]
 pub struct WeightsArgs {
     /// Weights: a run's folder (its best weights), a file (.safetensors, .pth, .npz), or a folder with encoder.pth,
-    /// depth.pth, ...; several times for several files.
-    #[arg(long, value_name = "FILE|DIR", required = true)]
+    /// depth.pth, ...; several times for several files. `shipped`: those inside the program.
+    #[arg(long, value_name = "FILE|DIR", default_value = SHIPPED)]
     weights: Vec<PathBuf>,
     /// Load the parameters that fit, and list the others.
     #[arg(long)]
@@ -29,6 +29,11 @@ impl WeightsArgs {
     pub fn name(&self) -> String {
         let names: Vec<_> = self.weights.iter().map(|w| w.to_string_lossy()).collect();
         names.join(", ")
+    }
+
+    /// Whether the network is to see pictures of another size than its weights were trained for.
+    pub fn resized(&self) -> bool {
+        self.height.is_some() || self.width.is_some()
     }
 
     /// Every path by itself, where there are several and each holds encoder and decoder of its own; otherwise all together,
@@ -52,6 +57,11 @@ impl WeightsArgs {
     /// The weights that were asked for, with the networks that are needed.
     pub fn load_with(&self, need: Need) -> Result<Weights> {
         self.check()?;
+        if self.weights.iter().any(|path| path.as_os_str() == SHIPPED) && Path::new(SHIPPED).exists() {
+            note!(
+                "`{SHIPPED}` means the weights inside the program, not ./{SHIPPED}: write --weights ./{SHIPPED} for that"
+            );
+        }
         let mut weights = weights::load(&self.weights, need, self.allow_partial)?;
         let averaged = weights.report.skipped.iter().find(|s| s.what.contains("averaged"));
         if weights.report.problem().is_some() {

@@ -18,6 +18,7 @@ pub mod predictor;
 pub mod projected;
 pub mod protocol;
 pub mod scale;
+pub mod shipping;
 pub mod statistics;
 pub mod study;
 pub mod trajectory;

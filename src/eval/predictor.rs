@@ -61,7 +61,8 @@ impl Predictor {
         Ok(self)
     }
 
-    /// Reads weights: a run's folder, or any file or folder that [`weights::load`] takes.
+    /// Reads weights: a run's folder, or any file or folder that [`weights::load`] takes; `"shipped"`
+    /// ([`weights::SHIPPED`]) means those inside the program.
     ///
     /// # Errors
     /// As [`weights::load`].

@@ -16,7 +16,7 @@ use super::pth::shown;
 use super::stored::{self, StoredTensor};
 use super::tensor_file::TensorFile;
 use crate::error::{Error, Result};
-use crate::tensor::{Float, Tensor};
+use crate::tensor::{Float, Tensor, bf16_bits};
 
 /// The largest file that is read, in bytes. The training state of the largest size has 2 GB.
 const MAX_FILE: u64 = 8 << 30;
@@ -26,23 +26,37 @@ const MAX_HEADER: u64 = 8 << 20;
 /// The metadata entry that holds the CRC-32 of all numbers, in the order of the tensors' names.
 const CHECKSUM: &str = "parallax_crc32";
 
-/// Calls `take` with the bytes of tensors in f32, a block after the other.
+/// The numbers of a file that is written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Numbers {
+    /// Four bytes each.
+    F32,
+    /// bfloat16, two bytes each: rounded to nearest, ties to even, to 8 bits of precision.
+    Bf16,
+}
+
+/// Calls `take` with the bytes of tensors, a block after the other.
 fn for_each_block<'a, T: Float, E>(
     tensors: impl Iterator<Item = &'a Tensor<T>>,
+    stored: Numbers,
     mut take: impl FnMut(&[u8]) -> Result<(), E>,
 ) -> Result<(), E> {
     let mut bytes = Vec::new();
     for numbers in tensors.flat_map(|t| t.data().chunks(1 << 14)) {
         bytes.clear();
-        bytes.extend(numbers.iter().flat_map(|x| (x.f64() as f32).to_le_bytes()));
+        let numbers = numbers.iter().map(|x| x.f64() as f32);
+        match stored {
+            Numbers::F32 => bytes.extend(numbers.flat_map(f32::to_le_bytes)),
+            Numbers::Bf16 => bytes.extend(numbers.flat_map(|x| bf16_bits(x).to_le_bytes())),
+        }
         take(&bytes)?;
     }
     Ok(())
 }
 
-fn checksum<'a, T: Float>(tensors: impl Iterator<Item = &'a Tensor<T>>) -> String {
+fn checksum<'a, T: Float>(tensors: impl Iterator<Item = &'a Tensor<T>>, stored: Numbers) -> String {
     let mut crc = crc32fast::Hasher::new();
-    let Ok(()) = for_each_block(tensors, |bytes| {
+    let Ok(()) = for_each_block(tensors, stored, |bytes| {
         crc.update(bytes);
         Ok::<(), std::convert::Infallible>(())
     });
@@ -59,14 +73,31 @@ pub fn write<T: Float>(
     tensors: &BTreeMap<String, Tensor<T>>,
     metadata: HashMap<String, String>,
 ) -> Result<()> {
+    write_in(path, tensors, metadata, Numbers::F32)
+}
+
+/// [`write`](write()), with numbers of this kind.
+///
+/// # Errors
+/// If the file cannot be written.
+pub fn write_in<T: Float>(
+    path: &Path,
+    tensors: &BTreeMap<String, Tensor<T>>,
+    metadata: HashMap<String, String>,
+    stored: Numbers,
+) -> Result<()> {
     let mut about: BTreeMap<String, String> = metadata.into_iter().collect();
-    about.insert(CHECKSUM.into(), checksum(tensors.values()));
+    about.insert(CHECKSUM.into(), checksum(tensors.values(), stored));
+    let (dtype, size) = match stored {
+        Numbers::F32 => ("F32", 4),
+        Numbers::Bf16 => ("BF16", 2),
+    };
     let mut header = serde_json::Map::from_iter([("__metadata__".to_owned(), serde_json::json!(about))]);
     let mut end = 0;
     for (name, tensor) in tensors {
         let start = end;
-        end += 4 * tensor.len();
-        let entry = serde_json::json!({"dtype": "F32", "shape": tensor.dims(), "data_offsets": [start, end]});
+        end += size * tensor.len();
+        let entry = serde_json::json!({"dtype": dtype, "shape": tensor.dims(), "data_offsets": [start, end]});
         header.insert(name.clone(), entry);
     }
     let mut header = serde_json::to_vec(&header).map_err(|e| Error::file(path, format!("its header: {e}")))?;
@@ -75,7 +106,7 @@ pub fn write<T: Float>(
     write_atomically(path, |writer| {
         writer.write_all(&(header.len() as u64).to_le_bytes())?;
         writer.write_all(&header)?;
-        for_each_block(tensors.values(), |bytes| writer.write_all(bytes))
+        for_each_block(tensors.values(), stored, |bytes| writer.write_all(bytes))
     })
 }
 
@@ -87,9 +118,22 @@ pub fn write<T: Float>(
 /// those of the checksum that [`write`](write()) added.
 pub fn open(path: &Path) -> Result<TensorFile> {
     let io = |e| Error::io(path, e);
-    let not = |why: String| Error::file(path, format!("not a safetensors file: {why}"));
-    let mut file = File::open(path).map_err(io)?;
+    let file = File::open(path).map_err(io)?;
     let size = file.metadata().map_err(io)?.len();
+    open_stream(file, size, path)
+}
+
+/// [`open`], of a file that is in memory; `name` is what errors call it.
+///
+/// # Errors
+/// As [`open`].
+pub fn open_bytes(bytes: &[u8], name: &Path) -> Result<TensorFile> {
+    open_stream(bytes, bytes.len() as u64, name)
+}
+
+fn open_stream(mut file: impl Read, size: u64, path: &Path) -> Result<TensorFile> {
+    let io = |e| Error::io(path, e);
+    let not = |why: String| Error::file(path, format!("not a safetensors file: {why}"));
     if size > MAX_FILE {
         return Err(Error::file(path, format!("has {size} bytes (at most {MAX_FILE} are read)")));
     }

@@ -42,7 +42,7 @@ const LANES: usize = 16;
 
 /// The nearest bf16, ties to even. NaN stays NaN.
 #[inline(always)]
-fn rounded(x: f32) -> u16 {
+pub(crate) fn rounded(x: f32) -> u16 {
     let bits = x.to_bits();
     let nearest = bits.wrapping_add(0x7fff + (bits >> 16 & 1)) >> 16;
     (if x.is_nan() { bits >> 16 | 0x40 } else { nearest }) as u16

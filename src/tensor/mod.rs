@@ -37,6 +37,7 @@ pub mod tape;
 pub mod var;
 
 pub use bf16::Precision;
+pub(crate) use bf16::rounded as bf16_bits;
 pub use compiled::Signature;
 pub use data::Tensor;
 pub use float::Float;

@@ -174,7 +174,7 @@ pub struct RunConfig {
     /// the folder, if there is any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prepared: Option<PathBuf>,
-    /// Weights to start from: files or folders, all four networks together.
+    /// Weights to start from: files or folders, all four networks together; `shipped` means those inside the program.
     #[serde(default, deserialize_with = "none_one_or_many", skip_serializing_if = "Vec::is_empty")]
     pub init: Vec<PathBuf>,
     /// Weights that the depth encoder starts from alone: an MPViT trained on ImageNet.

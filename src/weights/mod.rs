@@ -13,17 +13,19 @@
 //! [`Sources`] opens the files and finds out what each tensor is (`names.rs`) and which size of the network they belong
 //! to (`sizes.rs`). Loading is strict: every tensor of a network that is there, and no other, each finite, and the same
 //! under all its names. [`start_encoder`] and [`start_pose_encoder`] take networks that were trained on ImageNet.
-//! [`save`] writes any of these forms.
+//! [`save`] writes any of these forms. The path [`SHIPPED`] stands for the weights inside the program.
 
 mod imagenet;
 mod names;
 mod save;
+mod shipped;
 mod sizes;
 mod sources;
 
 pub use imagenet::{start_encoder, start_pose_encoder};
 pub use names::NETWORKS;
 pub use save::{Form, outputs, save};
+pub use shipped::{MOST_BYTES, Metres, Origin, SHIPPED, ship};
 pub use sources::{Need, Sources};
 
 use std::path::PathBuf;
@@ -31,6 +33,7 @@ use std::path::PathBuf;
 use crate::error::Result;
 use crate::monovit::{Ablation, MonoVit, Preset, Setup};
 use crate::nn::{Params, Report};
+use crate::tensor::bf16_bits;
 
 /// A model with weights from files.
 pub struct Weights {
@@ -42,6 +45,19 @@ pub struct Weights {
     pub setup: Setup,
     /// What was loaded and what was not.
     pub report: Report,
+    /// Where they come from, if their file says so.
+    pub origin: Option<Origin>,
+}
+
+impl Weights {
+    /// Rounds every number to bfloat16, as the file of shipped weights holds it.
+    pub fn round_to_bf16(&mut self) {
+        let ids: Vec<_> = self.params.iter().map(|(id, _)| id).collect();
+        for id in ids {
+            let value = self.params.value_mut(id);
+            *value = value.map(|x| f32::from_bits(u32::from(bf16_bits(x)) << 16));
+        }
+    }
 }
 
 /// Loads weights from files and folders; see [`Sources::open`] for which.
@@ -65,7 +81,7 @@ pub fn load_from(sources: &Sources, need: Need, allow_partial: bool) -> Result<W
     }
     let (model, mut params) = MonoVit::new(setup.model(), 0);
     let report = sources.fill(&mut params, need, allow_partial)?;
-    Ok(Weights { model, params, setup, report })
+    Ok(Weights { model, params, setup, report, origin: sources.origin().cloned() })
 }
 
 /// The setup that some files of weights, of all four networks, say or have by their size.

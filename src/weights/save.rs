@@ -1,6 +1,6 @@
 //! Weights as files: safetensors, `.npz`, `.pth`, or a folder with a `.pth` for each network, as the published ones are.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 
 use super::Weights;
@@ -63,6 +63,11 @@ fn loaded(weights: &Weights) -> Vec<Entry<'_>> {
     params.map(|p| Entry { names: &p.names, tensor: p.layout.export(&p.value) }).collect()
 }
 
+/// The parameters that were loaded, by name, in PyTorch's layout.
+pub(super) fn tensors(weights: &Weights) -> BTreeMap<String, Tensor<f32>> {
+    loaded(weights).into_iter().map(|entry| (entry.names[0].clone(), entry.tensor)).collect()
+}
+
 /// Where [`save`] would write: for a folder, the files in it.
 pub fn outputs(weights: &Weights, path: &Path, form: Form) -> Vec<PathBuf> {
     if form != Form::Folder {
@@ -91,9 +96,11 @@ pub fn save(weights: &Weights, path: &Path, form: Form) -> Result<()> {
     };
     match form {
         Form::Safetensors => {
-            let tensors = entries.iter().map(|e| (e.names[0].clone(), e.tensor.clone())).collect();
-            let metadata = if with_encoder { weights.setup.metadata()? } else { HashMap::new() };
-            safetensors::write(path, &tensors, metadata)
+            let mut metadata = if with_encoder { weights.setup.metadata()? } else { HashMap::new() };
+            if let (true, Some(origin)) = (with_encoder, &weights.origin) {
+                metadata.extend(origin.metadata()?);
+            }
+            safetensors::write(path, &tensors(weights), metadata)
         }
         Form::Npz => {
             let arrays: Vec<_> = entries.iter().map(|e| (&*e.names[0], e.tensor.dims(), e.tensor.data())).collect();

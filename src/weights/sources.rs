@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::names::{NETWORKS, Place, place, unwrapped, wrappers};
+use super::shipped::{self, Origin, SHIPPED};
 use super::sizes::Sizes;
 use crate::error::{Error, Result};
 use crate::formats::TensorFile;
@@ -47,14 +48,16 @@ pub struct Sources {
     /// `height` and `width`, where a file says them.
     size: [Option<usize>; 2],
     setup: Option<Setup>,
+    origin: Option<Origin>,
 }
 
 impl Sources {
     /// Opens files, or folders: a run's, which means its `best.safetensors`, or one with `encoder.pth`, `depth.pth`,
-    /// `pose_encoder.pth`, `pose.pth` (or some of them, or with other endings).
+    /// `pose_encoder.pth`, `pose.pth` (or some of them, or with other endings). The path [`SHIPPED`] means the weights
+    /// inside the program.
     ///
     /// # Errors
-    /// Names the file that cannot be read, or the folder without weights.
+    /// Names the file that cannot be read, or the folder without weights; if there are no weights inside the program.
     pub fn open(paths: &[PathBuf]) -> Result<Self> {
         Self::open_either(paths, false)
     }
@@ -75,8 +78,13 @@ impl Sources {
             skipped: Vec::new(),
             size: [None, None],
             setup: None,
+            origin: None,
         };
         for path in paths {
+            if path.as_os_str() == SHIPPED {
+                sources.add(shipped::open()?, averaged)?;
+                continue;
+            }
             let files = if path.is_dir() { files_of(path)? } else { vec![path.clone()] };
             for file in files {
                 sources.add(TensorFile::open(&file)?, averaged)?;
@@ -131,6 +139,11 @@ impl Sources {
         let said =
             Setup::from_metadata(&file.metadata).map_err(|e| Error::file(&*path, format!("its metadata: {e}")))?;
         self.setup = self.setup.or(said);
+        let said =
+            Origin::from_metadata(&file.metadata).map_err(|e| Error::file(&*path, format!("its metadata: {e}")))?;
+        if let (None, Some(origin)) = (&self.origin, said) {
+            self.origin = Some(origin);
+        }
         Ok(())
     }
 
@@ -225,6 +238,11 @@ impl Sources {
         let usual = Setup::of(self.preset(need)?);
         let [height, width] = self.size;
         Ok(Setup { height: height.unwrap_or(usual.height), width: width.unwrap_or(usual.width), ..usual })
+    }
+
+    /// Where the weights come from, if their file says so. Of weights that several paths give together nobody knows.
+    pub fn origin(&self) -> Option<&Origin> {
+        self.origin.as_ref().filter(|_| self.paths.len() == 1)
     }
 
     /// Puts the tensors into a model's parameters: all or none, unless `allow_partial`, which puts in what fits.

@@ -4,10 +4,11 @@ use std::path::{Path, PathBuf};
 
 use parallax::eval::odometry::Odometry;
 use parallax::eval::trajectory::write_poses;
-use parallax::formats::picture::read_picture;
+use parallax::formats::picture::{check_picture, read_picture};
 use parallax::{Error, Result};
 
 use super::outputs::Job;
+use super::scale::Scaling;
 
 /// Frames of one folder, in order, and the file of their poses.
 pub struct CameraPath {
@@ -39,8 +40,10 @@ pub fn of(jobs: &[Job], out: &Path) -> Result<Vec<CameraPath>> {
 }
 
 impl CameraPath {
-    /// Finds the poses and writes them; lengths times `scale`.
-    pub fn write(&self, odometry: &Odometry, scale: f64) -> Result<()> {
+    /// Finds the poses and writes them, lengths in the unit of depth.
+    pub fn write(&self, odometry: &Odometry, scaling: &Scaling) -> Result<()> {
+        let (width, height) = check_picture(&self.frames[0])?;
+        let scale = scaling.factor_of_all(scaling.camera(f64::from(width), f64::from(height)));
         let poses = odometry.path(self.frames.iter().map(|frame| read_picture(frame)), scale)?;
         write_poses(&self.file, &poses)?;
         note!("{} poses in {}", poses.len(), self.file.display());
