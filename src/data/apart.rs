@@ -53,6 +53,20 @@ mod tests {
     use super::*;
     use crate::data::camera::Camera;
     use crate::data::{Opening, open_folder};
+    use crate::street::{Street, StreetConfig};
+
+    #[test]
+    fn streets_of_other_seeds_have_nothing_in_common() {
+        let street = |seed: u64| {
+            let config =
+                StreetConfig { height: 8, width: 16, sequences: 2, frames: 5, seed, ..StreetConfig::default() };
+            Street::render(&config, None)
+        };
+        let (train, aside) = (street(0), street(1_000_000));
+        refuse_shared(&train, &aside, Path::new("none")).unwrap();
+        assert_eq!(neighbours(&train, &aside), None);
+        assert!(neighbours(&train, &street(0)).unwrap().contains("6 of 6"));
+    }
 
     #[test]
     fn equal_frames_are_refused_and_neighbours_are_warned_of() {

@@ -7,7 +7,7 @@ use image::RgbImage;
 use super::{DataSource, Place, no_second_camera};
 use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
-use crate::street::Street;
+use crate::street::{Street, StreetConfig, WorldKind};
 use crate::{Error, Result};
 
 impl DataSource for Street {
@@ -16,8 +16,17 @@ impl DataSource for Street {
     }
 
     fn name(&self, sample: usize) -> String {
-        let (sequence, frame) = self.locate(sample);
-        format!("street seed {}, sequence {sequence}, frame {frame}", self.config().seed)
+        format!("{}, frame {}", self.recording(sample), self.locate(sample).1)
+    }
+
+    /// Streets of different seeds share nothing.
+    fn recording(&self, sample: usize) -> String {
+        let StreetConfig { world, seed, .. } = self.config();
+        let world = match world {
+            WorldKind::Street1 => "street",
+            WorldKind::Street2 => "street-2",
+        };
+        format!("{world} seed {seed}, sequence {}", self.locate(sample).0)
     }
 
     fn image(&self, sample: usize, offset: i32) -> Result<Arc<RgbImage>> {

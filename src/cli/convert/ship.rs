@@ -6,7 +6,7 @@ use parallax::eval::predictor::Predictor;
 use parallax::eval::shipping::{calibrate, moved, on_streets, streets};
 use parallax::tensor::simd;
 use parallax::train::RunConfig;
-use parallax::train::data::STREET;
+use parallax::train::data::{STREET, STREET_2, is_rendered};
 use parallax::train::layers::read_config;
 use parallax::weights::{Need, Origin, SHIPPED, Sources, load_from, ship};
 use parallax::{Error, Result};
@@ -126,8 +126,10 @@ impl Shipped<'_> {
 
 /// What a run was trained on, in words.
 fn world(config: &RunConfig) -> String {
-    if config.data == STREET {
-        return format!("the program's own street, seed {}", config.seed);
+    match &config.data[..] {
+        STREET => return format!("the program's own street, seed {}", config.seed),
+        STREET_2 => return format!("the program's own street-2, seed {}", config.seed),
+        _ => {}
     }
     last_part(Path::new(&config.data)).display().to_string()
 }
@@ -141,7 +143,7 @@ fn steps(folder: &Path) -> Option<u64> {
 /// A run's configuration; of files only their names, because nobody else has this machine's folders.
 fn recipe(config: &RunConfig) -> Result<String> {
     let mut config = config.clone();
-    if config.data != STREET {
+    if !is_rendered(&config.data) {
         config.data = last_part(Path::new(&config.data)).display().to_string();
     }
     for path in [
