@@ -55,7 +55,7 @@ pub(crate) fn wide_street(draw: &mut Draw, frames: usize, moving: bool) -> World
         Country => draw.range(3.0, 4.5),
         Motorway => draw.range(6.5, 11.5),
     };
-    let moving = moving && kind != Residential || moving && draw.chance(0.5);
+    let moving = moving && (kind != Residential || draw.chance(0.5));
     // What drives goes straight ahead, so only an empty road bends.
     let bend = if moving || draw.chance(0.4) { 0.0 } else { draw.normal(0.0022).clamp(-0.005, 0.005) };
     let green = vary(draw, [0.20, 0.27, 0.12], 0.05, 0.07);

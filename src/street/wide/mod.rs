@@ -15,3 +15,6 @@ mod vehicles;
 pub(crate) use build::wide_street;
 pub(crate) use look::Look;
 pub(crate) use ride::{camera, ride};
+
+#[cfg(test)]
+mod tests;
