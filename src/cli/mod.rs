@@ -23,6 +23,7 @@ mod gradcheck;
 mod info;
 mod predict;
 mod progress;
+mod report;
 mod sheet;
 mod sizes;
 mod stereo;
@@ -53,6 +54,8 @@ enum Command {
     Eval(eval::Args),
     /// Predict depth maps of pictures.
     Predict(predict::Args),
+    /// Make the page of a run, or one that compares several: curves, warnings, pictures, configuration.
+    Report(report::Args),
     /// Convert weights between file formats: PyTorch's .pth, safetensors, NumPy's .npz.
     Convert(convert::Args),
     /// Draw attention maps of a pixel, by path and head, and the saliency of its disparity.
@@ -77,6 +80,7 @@ pub fn main() -> ExitCode {
         Command::Train(args) => train::run(*args),
         Command::Eval(args) => eval::run(args),
         Command::Predict(args) => predict::run(args),
+        Command::Report(args) => report::run(args),
         Command::Convert(args) => convert::run(args),
         Command::Attention(args) => attention::run(args),
         Command::Gradcheck(args) => gradcheck::run(args),

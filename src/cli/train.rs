@@ -22,6 +22,7 @@ use super::camera::CameraArgs;
 use super::control::Control;
 use super::film::FilmArgs;
 use super::progress::Progress;
+use super::report;
 use super::stereo::StereoArgs;
 
 #[derive(clap::Args)]
@@ -167,7 +168,22 @@ pub fn run(args: Args) -> Result<()> {
     }
     let began = Instant::now();
     let mut progress = Progress::new("training", run.config.steps);
-    let ended = run.train(&data, || stop.asked.load(Ordering::SeqCst), |event| show(&event, &mut progress, &stop))?;
+    let place = run.folder.clone();
+    if let Err(error) = report::record_machine(&place) {
+        note!("warning: the machine could not be noted: {error}");
+    }
+    let ended = run.train(
+        &data,
+        || stop.asked.load(Ordering::SeqCst),
+        |event| {
+            show(&event, &mut progress, &stop);
+            if matches!(event, Event::Validated(_)) {
+                report::leave(&place, true);
+            }
+        },
+    );
+    report::leave(&place, false);
+    let ended = ended?;
     stop.waits.store(false, Ordering::SeqCst);
     progress.finish();
     let folder = run.folder.display();
@@ -188,7 +204,7 @@ pub fn run(args: Args) -> Result<()> {
             let seconds = began.elapsed().as_secs_f64();
             let skipped = skipped(&run);
             note!(
-                "done in {seconds:.0} s, {:.0} s of them training; look at {folder}/images{skipped}",
+                "done in {seconds:.0} s, {:.0} s of them training; look at {folder}/report.html{skipped}",
                 metrics.seconds
             );
         }

@@ -1,11 +1,13 @@
 //! How good the weights of a run are: on validation data as it goes on, on test data before and after.
 
+use std::fs;
 use std::path::Path;
 
+use image::codecs::jpeg::JpegEncoder;
 use serde::{Deserialize, Serialize};
 
 use super::log::Log;
-use super::run::{BEST, Event, LAST, Run, RunData, load_weights, write_weights};
+use super::run::{BEST, Event, LAST, PAGES, Run, RunData, load_weights, write_weights};
 use crate::data::DataSource;
 use crate::data::batch::{Augment, Batch, Making, batch_of_readable, batch_of_step};
 use crate::error::{Error, Result};
@@ -60,6 +62,8 @@ pub struct Validation {
     pub a1: Option<f64>,
 }
 
+/// How many pictures of every validation are kept.
+const KEPT: usize = 3;
 /// How a run measures depth: every pixel with ground truth, at the truth's median.
 const DENSE: Evaluation = Evaluation { protocol: Protocol::Dense, scale: Scale::Median, flip: false };
 
@@ -135,7 +139,7 @@ impl Run {
             log.write(&line)?;
             tell(Event::Validated(&line));
             let shown = data.test.as_deref().unwrap_or(data.validation.as_ref());
-            told("pictures", write_images(&self.folder, &predictor, shown), tell);
+            told("pictures", write_images(&self.folder, &predictor, shown, Some(step)), tell);
         }
         self.notes.validated = step;
         self.notes.write(&self.folder, step)
@@ -157,7 +161,7 @@ impl Run {
         let (model, params, setup) = load_weights(&best)?;
         let predictor = Predictor::new(&model, &params, &setup);
         let shown = data.test.as_deref().unwrap_or(data.validation.as_ref());
-        told("pictures", write_images(&self.folder, &predictor, shown), tell);
+        told("pictures", write_images(&self.folder, &predictor, shown, None), tell);
         let report = data.test.as_deref().and_then(|test| {
             let samples: Vec<usize> = (0..test.len()).collect();
             told("the best weights", evaluate(&predictor, test, &samples, DENSE, |_| ()), tell)
@@ -197,8 +201,9 @@ fn told<T>(what: &str, found: Result<T>, tell: &mut impl FnMut(Event)) -> Option
     found.inspect_err(|e| tell(Event::Warning(&format!("{what} could not be measured: {e}")))).ok()
 }
 
-/// A few pictures with their predicted disparity (and the true one, where it is known) below.
-fn write_images(folder: &Path, predictor: &Predictor, data: &dyn DataSource) -> Result<()> {
+/// A few pictures with their predicted disparity (and the true one, where it is known) below; the first of them are kept
+/// under the step, too, if it is given.
+fn write_images(folder: &Path, predictor: &Predictor, data: &dyn DataSource, step: Option<u64>) -> Result<()> {
     let count = data.len().min(8);
     for i in 0..count {
         let sample = i * data.len() / count;
@@ -220,6 +225,14 @@ fn write_images(folder: &Path, predictor: &Predictor, data: &dyn DataSource) -> 
         }
         let path = folder.join(format!("images/{i:02}.png"));
         write_png(&path, &sheet)?;
+        if let Some(step) = step.filter(|_| i < KEPT) {
+            let path = folder.join(PAGES).join(format!("{step:07}-{i}.jpg"));
+            let mut jpeg = Vec::new();
+            let written = sheet.write_with_encoder(JpegEncoder::new_with_quality(&mut jpeg, 85));
+            written.map_err(|e| Error::file(&path, format!("could not be made: {e}")))?;
+            fs::create_dir_all(folder.join(PAGES)).map_err(|e| Error::io(&path, e))?;
+            write_bytes_atomically(&path, &jpeg)?;
+        }
     }
     Ok(())
 }
