@@ -1,7 +1,7 @@
 //! The street as a dataset: sequences rendered once, kept as pictures; depth is cast again when it is asked for.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, OnceLock};
 
 use image::RgbImage;
 use rayon::prelude::*;
@@ -79,6 +79,8 @@ struct Sequence {
     poses: Vec<Pose>,
     intrinsics: Intrinsics,
     images: Vec<Arc<RgbImage>>,
+    /// Depth of the frames, once it was asked for: rendering it takes as long as a picture.
+    depths: Vec<OnceLock<DepthMap>>,
     /// Frames of the second camera; empty without one.
     right: Vec<Arc<RgbImage>>,
 }
@@ -177,7 +179,8 @@ impl Street {
             let images = poses.par_iter().enumerate().map(|(frame, pose)| image(frame, *pose)).collect();
             let right = poses.par_iter().enumerate().map(|(frame, pose)| image(frame, pose.beside(config.baseline)));
             let right = if config.baseline == 0.0 { Vec::new() } else { right.collect() };
-            Sequence { world, poses, intrinsics, images, right }
+            let depths = poses.iter().map(|_| OnceLock::new()).collect();
+            Sequence { world, poses, intrinsics, images, depths, right }
         };
         Street { config: config.clone(), sequences: (0..config.sequences).into_par_iter().map(sequence).collect() }
     }
@@ -210,8 +213,9 @@ impl Street {
 
     /// The depth of a frame at the pixels' centres: camera z in metres, 0 for the sky. Panics if there is none such.
     pub fn frame_depth(&self, sequence: usize, frame: usize) -> DepthMap {
-        let Sequence { world, poses, intrinsics, .. } = &self.sequences[sequence];
-        Scene::new(world, View::new(&self.config, *intrinsics, poses[frame]), frame).depth()
+        let Sequence { world, poses, intrinsics, depths, .. } = &self.sequences[sequence];
+        let render = || Scene::new(world, View::new(&self.config, *intrinsics, poses[frame]), frame).depth();
+        depths[frame].get_or_init(render).clone()
     }
 
     /// How many samples there are: frames that have both neighbours.

@@ -76,7 +76,9 @@ pub(super) fn bytes_held(config: &RunConfig) -> f64 {
         STREET_2 => cameras * WIDE_SEQUENCES.iter().sum::<usize>() * WIDE_FRAMES,
         _ => 0,
     };
-    3.0 * (frames * config.height * config.width) as f64
+    // Three bytes of a pixel, and where depth is learnt from, four more.
+    let each = if config.loss.depth_supervision > 0.0 { 7.0 } else { 3.0 };
+    each * (frames * config.height * config.width) as f64
 }
 
 fn street(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + Sync)) -> RunData {
