@@ -33,8 +33,8 @@ pub struct Record {
     pub pictures: Vec<PathBuf>,
     /// Pictures as training went on: the step, the sample, the file.
     pub snapshots: Vec<(u64, usize, PathBuf)>,
-    /// Views of the last validation, and of the end.
-    pub views: Vec<Views>,
+    /// Views of the last validation, and of the end, each under the name of its list.
+    pub views: Vec<(&'static str, Views)>,
     /// The folder that holds their pictures.
     place: PathBuf,
     /// Things that could not be read, in words.
@@ -66,7 +66,7 @@ impl Record {
             metrics: json(folder, "metrics.json", &mut problems),
             machine: json(folder, "machine.json", &mut problems),
             pictures: files(&folder.join("images")).into_iter().filter(|p| has_ending(p, "png")).collect(),
-            views: [AT_VALIDATION, AT_END].iter().filter_map(|list| views(folder, list, &mut problems)).collect(),
+            views: [AT_VALIDATION, AT_END].into_iter().filter_map(|list| views(folder, list, &mut problems)).collect(),
             place: folder.join("views"),
             snapshots: files(&folder.join("pages")).into_iter().filter_map(snapshot).collect(),
             steps,
@@ -175,11 +175,11 @@ fn json(folder: &Path, name: &str, problems: &mut Vec<String>) -> Value {
 }
 
 /// A list of views; `None` where there is none, which is told only if it cannot be read.
-fn views(folder: &Path, list: &str, problems: &mut Vec<String>) -> Option<Views> {
+fn views(folder: &Path, list: &'static str, problems: &mut Vec<String>) -> Option<(&'static str, Views)> {
     match json(folder, &format!("views/{list}"), problems) {
         Value::Null => None,
         found => {
-            let views = serde_json::from_value(found).ok();
+            let views = serde_json::from_value(found).ok().map(|views| (list, views));
             if views.is_none() {
                 problems.push(format!("views/{list} is none of this version's and is left out"));
             }

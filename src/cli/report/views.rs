@@ -2,7 +2,7 @@
 
 use maud::{Markup, PreEscaped, html};
 use parallax::report::plot::{Line, Plot};
-use parallax::train::views::{Group, Views};
+use parallax::train::views::{AT_END, Group, Views};
 
 use super::pictures::Album;
 use super::record::Record;
@@ -13,7 +13,8 @@ const ROWS: usize = 12;
 /// All views, kind by kind, those of several runs below each other.
 pub fn views(runs: &[Record], album: &mut Album) -> Markup {
     let mut kinds: Vec<&str> = Vec::new();
-    for kind in runs.iter().flat_map(|run| &run.views).flat_map(|views| &views.groups).map(|group| group.kind.as_str())
+    for kind in
+        runs.iter().flat_map(|run| &run.views).flat_map(|(_, views)| &views.groups).map(|group| group.kind.as_str())
     {
         if !kinds.contains(&kind) {
             kinds.push(kind);
@@ -26,9 +27,9 @@ pub fn views(runs: &[Record], album: &mut Album) -> Markup {
         @for kind in kinds {
             h2 { (kind) }
             @for run in runs {
-                @for views in &run.views {
+                @for (list, views) in &run.views {
                     @for group in views.groups.iter().filter(|group| group.kind == kind) {
-                        (shown(run, views.step, group, album))
+                        (shown(run, &weights(list, views), group, album))
                     }
                 }
             }
@@ -36,9 +37,18 @@ pub fn views(runs: &[Record], album: &mut Album) -> Markup {
     }
 }
 
-fn shown(run: &Record, step: u64, group: &Group, album: &mut Album) -> Markup {
+fn views_of(run: &Record) -> impl Iterator<Item = &Views> {
+    run.views.iter().map(|(_, views)| views)
+}
+
+/// The weights that a list shows, in words.
+fn weights(list: &str, views: &Views) -> String {
+    if list == AT_END { "best weights".into() } else { format!("step {}", views.step) }
+}
+
+fn shown(run: &Record, weights: &str, group: &Group, album: &mut Album) -> Markup {
     html! {
-        h3 { (run.name) ", " (group.about) ", step " (step) }
+        h3 { (run.name) ", " (group.about) ", " (weights) }
         div.pictures {
             @for view in &group.views {
                 @if let Some(address) = album.exact(&run.view(&view.file)) {
@@ -60,7 +70,7 @@ fn shown(run: &Record, step: u64, group: &Group, album: &mut Album) -> Markup {
 /// Where the time of a step goes, by run.
 pub fn time(runs: &[Record]) -> Markup {
     let known: Vec<(&Record, &Views)> =
-        runs.iter().filter_map(|run| Some((run, run.views.iter().find(|views| !views.time.is_empty())?))).collect();
+        runs.iter().filter_map(|run| Some((run, views_of(run).find(|views| !views.time.is_empty())?))).collect();
     html! {
         h2 { "Where a step's time goes" }
         @if known.is_empty() { p.note { "It is not recorded: the first validation of a run of this version measures it." } }
@@ -91,7 +101,7 @@ pub fn time(runs: &[Record]) -> Markup {
 /// The camera's path from above, of all runs in one chart; nothing where none is known.
 pub fn path(runs: &[Record]) -> Markup {
     let known: Vec<(&Record, &Views)> =
-        runs.iter().filter_map(|run| Some((run, run.views.iter().find(|views| views.path.len() > 1)?))).collect();
+        runs.iter().filter_map(|run| Some((run, views_of(run).find(|views| views.path.len() > 1)?))).collect();
     let Some((_, first)) = known.first() else { return html! {} };
     let unit = if known.iter().all(|(_, views)| views.metres) { "m" } else { "unit of predicted depth" };
     let line = |(run, views): &(&Record, &Views)| Line {
