@@ -1,6 +1,7 @@
 //! Training runs from the outside: resumed and uninterrupted runs agree, and bad input costs no time.
 #![cfg(feature = "cli")]
 
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::{Command, Output};
 use std::sync::Arc;
@@ -16,6 +17,7 @@ use parallax::train::RunConfig;
 use parallax::train::recipe::read_config;
 use parallax::train::rotations::Rotations;
 use parallax::train::run::{Ended, Event, Run, RunData, RunMetrics, load_weights};
+use parallax::train::views::{AT_END, AT_VALIDATION, Views};
 
 fn street(seed: u64) -> Arc<dyn DataSource> {
     let config = StreetConfig { height: 64, width: 96, sequences: 1, frames: 8, seed, ..StreetConfig::default() };
@@ -89,6 +91,23 @@ fn a_resumed_run_ends_like_one_that_never_stopped() {
     assert!(metrics.after.expect("measured").abs_rel > 0.0 && metrics.before != metrics.after, "{metrics:?}");
     for file in ["metrics.json", "config.toml", "images/00.png", "checkpoints/state.safetensors"] {
         assert!(parts.join(file).is_file(), "{file}");
+    }
+    // The views of the page: errors, warps, attention and times of the last validation, path and worst samples of the end.
+    let views = |list: &str| -> Views {
+        serde_json::from_slice(&std::fs::read(parts.join("views").join(list)).expect("a list")).expect("views")
+    };
+    let (last, end) = (views(AT_VALIDATION), views(AT_END));
+    let kinds = |views: &Views| views.groups.iter().map(|group| group.kind.clone()).collect::<BTreeSet<_>>();
+    let expected = ["Attention of query pixels", "Depth and its error", "Warped neighbours and auto-mask"];
+    assert!(kinds(&last).iter().eq(expected), "{:?}", kinds(&last));
+    assert!(kinds(&end).iter().eq(["Worst samples"]) && end.path.len() > 1 && end.metres, "{end:?}");
+    assert!(
+        last.step == 5 && last.time.iter().any(|(op, seconds)| op == "conv2d" && *seconds > 0.0),
+        "{:?}",
+        last.time
+    );
+    for view in last.groups.iter().chain(&end.groups).flat_map(|group| &group.views) {
+        image::open(parts.join("views").join(&view.file)).expect("a picture");
     }
 }
 

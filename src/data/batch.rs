@@ -111,7 +111,7 @@ impl Batch {
 }
 
 /// The 8-bit images that a tensor was made of by [`to_tensor`].
-fn to_images(tensor: &Tensor<f32>) -> Vec<RgbImage> {
+pub(crate) fn to_images(tensor: &Tensor<f32>) -> Vec<RgbImage> {
     let [_, h, w, _] = tensor.shape().nhwc().expect("images");
     let image = |pixels: &[f32]| {
         let bytes = pixels.iter().map(|&x| (x * 255.0).round() as u8).collect();

@@ -15,6 +15,7 @@ pub mod start;
 mod state;
 pub mod trainer;
 mod validation;
+pub mod views;
 pub mod vitals;
 
 pub use recipe::{OptimConfig, Plan, RunConfig};

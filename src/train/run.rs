@@ -3,7 +3,7 @@
 //! `RUN/config.toml` (all of it, to run it again), `log.jsonl` (a line a logged step and a validation), `warnings.jsonl` (a
 //! line where a warning of [`health`](super::health) begins or ends), `checkpoints/` (the whole state, and the one before
 //! it), `best.safetensors` and `last.safetensors`, `metrics.json`, `images/` (of the last
-//! validation), `pages/` (a few of every validation).
+//! validation), `pages/` (a few of every validation), `views/` ([`views`](super::views) of the last).
 //!
 //! What is computed is never lost: the state is written before anything is measured, and nothing that only concerns
 //! reporting ends a training.
@@ -165,7 +165,9 @@ impl Run {
         change(&mut config)?;
         config.check()?;
         let lock = lock(folder)?;
-        for place in [folder.to_owned(), folder.join(CHECKPOINTS), folder.join("images"), folder.join(PAGES)] {
+        for place in
+            [folder.to_owned(), folder.join(CHECKPOINTS), folder.join("images"), folder.join(PAGES), folder.join(VIEWS)]
+        {
             atomic::clean(place);
         }
         let mut trainer = Trainer::new(config.model(), config.plan());
@@ -358,6 +360,8 @@ pub(super) const LAST: &str = "last.safetensors";
 pub(super) const CHECKPOINTS: &str = "checkpoints";
 /// The folder of pictures as training goes on, `STEP-SAMPLE.jpg`.
 pub(super) const PAGES: &str = "pages";
+/// The folder of [`views`](super::views).
+pub(super) const VIEWS: &str = "views";
 const LOCK: &str = ".lock";
 
 /// Takes the run for this process, until the file is closed, be it by a crash.

@@ -138,7 +138,7 @@ fn views(batch: &Batch, scales: Scales) -> Views<f32> {
 
 /// Transforms of points from the targets' cameras to those of their sources, `[B, 3, 4]` each: what the pose network sees in
 /// neighbours, what is known of a second camera.
-fn transforms(model: &MonoVit, c: &Context<f32>, batch: &Batch, target: &Var<f32>) -> Vec<Var<f32>> {
+pub(super) fn transforms(model: &MonoVit, c: &Context<f32>, batch: &Batch, target: &Var<f32>) -> Vec<Var<f32>> {
     let in_time = batch.neighbours.as_ref().map(|neighbours| {
         let [prev, next] = neighbours.each_ref().map(|t| Var::constant(t.clone()));
         model.transforms(c, &prev, target, &next)
@@ -362,6 +362,11 @@ impl Trainer {
         };
         profile::phase("freeing", move || drop((all, objective, found, disparity, transforms, tape)));
         Ok(Pass { gradients, moved, report })
+    }
+
+    /// Takes the passes of a step, forward and backward, for its time alone: no weight is changed.
+    pub(super) fn rehearse(&self, batch: &Batch) -> Result<()> {
+        self.pass(0, batch).map(drop)
     }
 
     /// Runs the forward pass once more, looking at every number.

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::log::Log;
 use super::run::{BEST, Event, LAST, PAGES, Run, RunData, load_weights, write_weights};
+use super::views::Shown;
 use crate::data::DataSource;
 use crate::data::batch::{Augment, Batch, Making, batch_of_readable, batch_of_step};
 use crate::error::{Error, Result};
@@ -140,6 +141,9 @@ impl Run {
             tell(Event::Validated(&line));
             let shown = data.test.as_deref().unwrap_or(data.validation.as_ref());
             told("pictures", write_images(&self.folder, &predictor, shown, Some(step)), tell);
+            let setup = self.config.setup();
+            let shown = Shown { model: &self.trainer.model, params: &weights, setup, data: shown };
+            told("views of the weights", self.view_validation(&shown, &batches[0]), tell);
         }
         self.notes.validated = step;
         self.notes.write(&self.folder, step)
@@ -166,6 +170,8 @@ impl Run {
             let samples: Vec<usize> = (0..test.len()).collect();
             told("the best weights", evaluate(&predictor, test, &samples, DENSE, |_| ()), tell)
         });
+        let shown = Shown { model: &model, params: &params, setup, data: shown };
+        told("views of the best weights", self.view_end(&shown, report.as_ref()), tell);
         let images = report.as_ref().map_or(0, |r| r.images);
         let first = report.as_ref().and_then(|r| r.per_image.first()).map(|image| image.name.as_str());
         let metrics = RunMetrics {

@@ -5,6 +5,7 @@ mod machine;
 mod page;
 mod pictures;
 mod record;
+mod views;
 
 use std::path::{Path, PathBuf};
 

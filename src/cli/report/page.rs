@@ -11,6 +11,7 @@ use serde_json::Value;
 use super::curves;
 use super::pictures::Album;
 use super::record::Record;
+use super::views;
 
 const STYLE: &str = include_str!("page.css");
 const SCRIPT: &str = include_str!("page.js");
@@ -25,7 +26,8 @@ pub fn page(runs: &[Record], running: bool, missing: &[String]) -> String {
         _ => format!("Runs {}", names.join(", ")),
     };
     let mut album = Album::default();
-    let shown = html! { (over_time(runs, &mut album)) (last_pictures(runs, &mut album)) };
+    let shown =
+        html! { (over_time(runs, &mut album)) (last_pictures(runs, &mut album)) (views::views(runs, &mut album)) };
     let markup = html! {
         (DOCTYPE)
         html lang="en" {
@@ -60,6 +62,8 @@ pub fn page(runs: &[Record], running: bool, missing: &[String]) -> String {
                             }
                         }
                     }
+                    (views::path(runs))
+                    (views::time(runs))
                     (settings(runs))
                     (machines(runs))
                 }

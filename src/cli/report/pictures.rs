@@ -28,13 +28,24 @@ impl Default for Album {
 }
 
 impl Album {
-    /// A picture as the address of an image, if it can be read and there is room.
+    /// A picture as it is, JPEG or PNG, if it can be read and there is room.
+    pub fn exact(&mut self, path: &Path) -> Option<String> {
+        let bytes = record::picture(path).ok().filter(|bytes| image::load_from_memory(bytes).is_ok());
+        let kind = if path.extension().is_some_and(|e| e == "png") { "png" } else { "jpeg" };
+        self.place(kind, bytes)
+    }
+
+    /// A picture as the address of an image, turned into a JPEG, if it can be read and there is room.
     pub fn address(&mut self, path: &Path) -> Option<String> {
-        let Some(jpeg) = jpeg(path) else {
+        self.place("jpeg", jpeg(path))
+    }
+
+    fn place(&mut self, kind: &str, bytes: Option<Vec<u8>>) -> Option<String> {
+        let Some(bytes) = bytes else {
             self.unreadable += 1;
             return None;
         };
-        let address = format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg));
+        let address = format!("data:image/{kind};base64,{}", STANDARD.encode(bytes));
         if address.len() > self.left {
             self.left_out += 1;
             return None;

@@ -4,6 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use parallax::formats::bounded::{MAX_SETTINGS, read_bounded};
+use parallax::train::views::{AT_END, AT_VALIDATION, Views};
 use parallax::{Error, Result};
 use serde_json::Value;
 
@@ -32,6 +33,10 @@ pub struct Record {
     pub pictures: Vec<PathBuf>,
     /// Pictures as training went on: the step, the sample, the file.
     pub snapshots: Vec<(u64, usize, PathBuf)>,
+    /// Views of the last validation, and of the end, each under the name of its list.
+    pub views: Vec<(&'static str, Views)>,
+    /// The folder that holds their pictures.
+    place: PathBuf,
     /// Things that could not be read, in words.
     pub problems: Vec<String>,
 }
@@ -61,12 +66,19 @@ impl Record {
             metrics: json(folder, "metrics.json", &mut problems),
             machine: json(folder, "machine.json", &mut problems),
             pictures: files(&folder.join("images")).into_iter().filter(|p| has_ending(p, "png")).collect(),
+            views: [AT_VALIDATION, AT_END].into_iter().filter_map(|list| views(folder, list, &mut problems)).collect(),
+            place: folder.join("views"),
             snapshots: files(&folder.join("pages")).into_iter().filter_map(snapshot).collect(),
             steps,
             validations,
             warnings,
             problems,
         })
+    }
+
+    /// The file of a view: never one outside the folder of views, whatever the list says.
+    pub fn view(&self, file: &str) -> PathBuf {
+        self.place.join(Path::new(file).file_name().unwrap_or_default())
     }
 
     /// The last logged step.
@@ -160,6 +172,20 @@ fn json(folder: &Path, name: &str, problems: &mut Vec<String>) -> Value {
         problems.push(format!("{name} cannot be read and is left out"));
         Value::Null
     })
+}
+
+/// A list of views; `None` where there is none, which is told only if it cannot be read.
+fn views(folder: &Path, list: &'static str, problems: &mut Vec<String>) -> Option<(&'static str, Views)> {
+    match json(folder, &format!("views/{list}"), problems) {
+        Value::Null => None,
+        found => {
+            let views = serde_json::from_value(found).ok().map(|views| (list, views));
+            if views.is_none() {
+                problems.push(format!("views/{list} is none of this version's and is left out"));
+            }
+            views
+        }
+    }
 }
 
 fn config(folder: &Path, problems: &mut Vec<String>) -> Vec<(String, String)> {

@@ -65,3 +65,32 @@ fn a_folder_without_a_run_is_refused_and_one_without_a_log_is_shown() {
     let run = Record::read(folder.path()).unwrap();
     assert!(page::page(&[run], false, &[]).contains("there is no log.jsonl"));
 }
+
+#[test]
+fn views_are_shown_and_none_is_read_from_outside() {
+    let folder = run("3");
+    let place = folder.path().join("views");
+    fs::create_dir(&place).unwrap();
+    image::RgbImage::new(8, 8).save(place.join("error.png")).unwrap();
+    image::RgbImage::new(8, 8).save(folder.path().join("outside.png")).unwrap();
+    let list = r#"{"step":3,"time":[["conv2d",0.003],["warp",0.001]],"path":[[0,0],[0.5,2]],"metres":true,"groups":[
+        {"kind":"Depth and its error","about":"<frame>","views":[
+            {"file":"error.png","title":"Error","bar":["0","50 % and more"]},{"file":"../outside.png","title":"Outside"}]}]}"#;
+    fs::write(place.join("validation.json"), list).unwrap();
+    fs::write(place.join("end.json"), "[3]").unwrap();
+    let run = Record::read(folder.path()).unwrap();
+    let page = page::page(&[run], false, &[]);
+    let expected = [
+        "data:image/png;base64,",
+        "50 % and more",
+        "&lt;frame&gt;",
+        "<td>75.0 %</td>",
+        "ends 0.5 to the right and 2.0 ahead (m)",
+        "1 pictures cannot be read",
+        "views/end.json is none of this version",
+    ];
+    for expected in expected {
+        assert!(page.contains(expected), "{expected}");
+    }
+    assert!(!page.contains("Outside"));
+}

@@ -1,0 +1,123 @@
+//! Views that need the weights and a data set alone: errors, attention, the camera's path.
+
+use super::place::Place;
+use super::{Group, Shown};
+use crate::data::DataSource;
+use crate::data::batch::to_tensor;
+use crate::error::Result;
+use crate::eval::attention::attention;
+use crate::eval::odometry::{Odometry, joined};
+use crate::eval::predictor::Predictor;
+use crate::eval::trajectory::Pose;
+use crate::report::map::{draw_map, draw_values};
+use crate::report::overlay::{Overlay, mark};
+
+/// The most frames of the camera's path.
+const PATH: usize = 100;
+/// The error, as a share of the true depth, that is brightest.
+const WORST: f64 = 0.5;
+/// Query pixels of attention: row and column, as shares of the picture.
+const QUERIES: [[f64; 2]; 3] = [[0.8, 0.5], [0.55, 0.2], [0.5, 0.75]];
+
+/// A frame, its predicted depth, the true one, and the error as a share of it; nothing where there is no truth.
+pub(super) fn error_group(
+    place: &Place,
+    predictor: &Predictor,
+    data: &dyn DataSource,
+    sample: usize,
+    name: &str,
+    kind: &str,
+) -> Result<Option<Group>> {
+    let Some(truth) = data.depth(sample)? else { return Ok(None) };
+    let image = data.image(sample, 0)?;
+    let size = image.dimensions();
+    let found = predictor.inverse_depth(&image, false).resized(truth.height, truth.width, 1.0);
+    let known: Vec<usize> = (0..truth.metres.len()).filter(|&i| (1e-3..=80.0).contains(&truth.metres[i])).collect();
+    if known.is_empty() || !found.is_whole() {
+        return Ok(None);
+    }
+    let scale = median(known.iter().map(|&i| f64::from(truth.metres[i])))
+        / median(known.iter().map(|&i| 1.0 / f64::from(found.values[i])));
+    let depth = |i: usize| scale / f64::from(found.values[i]);
+    let error = |i: usize| (depth(i) - f64::from(truth.metres[i])).abs() / f64::from(truth.metres[i]);
+    let dims = (truth.height, truth.width);
+    let near = known.iter().map(|&i| truth.metres[i]).fold(f32::INFINITY, f32::min).max(1.0);
+    let range = [0.0, 1.0 / f64::from(near)];
+    let bar = || ["far".to_owned(), format!("{near:.1} m")];
+    let reach = if known.len() * 3 < truth.metres.len() { 2 } else { 0 };
+    let draw = |of: &dyn Fn(usize) -> f64, range| {
+        draw_values(known.iter().map(|&i| (i / dims.1, i % dims.1, of(i))), dims, size, range, reach)
+    };
+    let whole: Vec<f64> = (0..truth.metres.len()).map(|i| 1.0 / depth(i)).collect();
+    let mean = known.iter().map(|&i| error(i)).sum::<f64>() / known.len() as f64;
+    let views = vec![
+        place.photo(&format!("{name}-frame"), "Frame", &image)?,
+        place.map(
+            &format!("{name}-depth"),
+            "Predicted depth, at the truth's median",
+            &draw_map(&whole, dims, size, range),
+            bar(),
+        )?,
+        place.map(
+            &format!("{name}-truth"),
+            "True depth",
+            &draw(&|i| 1.0 / f64::from(truth.metres[i]), range),
+            bar(),
+        )?,
+        place.map(
+            &format!("{name}-error"),
+            "Error over true depth",
+            &draw(&error, [0.0, WORST]),
+            ["0".into(), format!("{:.0} % and more", 100.0 * WORST)],
+        )?,
+    ];
+    Ok(Some(Group { kind: kind.into(), about: format!("{}, Abs Rel {mean:.3}", data.name(sample)), views }))
+}
+
+/// The places that a few pixels of the first sample look at; nothing in networks without transformer paths.
+pub(super) fn attention_group(place: &Place, shown: &Shown) -> Result<Option<Group>> {
+    let image = shown.data.image(0, 0)?;
+    let (w, h) = image.dimensions();
+    let (seen, overlay) = (to_tensor(&[&image]), Overlay::new(&image));
+    let mut views = Vec::new();
+    for (i, [y, x]) in QUERIES.into_iter().enumerate() {
+        let pixel = [(y * f64::from(h)) as usize, (x * f64::from(w)) as usize];
+        let found = attention(shown.model, shown.params, &seen, pixel);
+        // The last layer of the first path, at 1/8 of the picture: fine enough to be seen.
+        let Some(rows) = found.rows.iter().rfind(|rows| rows.stage == 1 && rows.path == 0) else { continue };
+        let map = rows.mean();
+        let &[rows, columns] = map.dims() else { unreachable!("maps have two dimensions") };
+        let mut made = overlay.signed(map.data(), (rows, columns));
+        mark(&mut made, pixel[1] as f32, pixel[0] as f32);
+        views.push(place.photo(
+            &format!("attention{i}"),
+            &format!("Pixel {}, {} (ring)", pixel[1], pixel[0]),
+            &made,
+        )?);
+    }
+    let about =
+        format!("{}: warm is looked at, cold is looked away from (last layer at 1/8 of the size)", shown.data.name(0));
+    Ok((!views.is_empty()).then(|| Group { kind: "Attention of query pixels".into(), about, views }))
+}
+
+/// The camera's path over frames that follow one another, from above; empty if there are no such frames at the beginning.
+pub(super) fn path(shown: &Shown, scale: f64) -> Result<Vec<[f64; 2]>> {
+    let data = shown.data;
+    let follows = |&sample: &usize| {
+        let (a, b) = (data.place(sample), data.place(sample + 1));
+        data.recording(sample) == data.recording(sample + 1) && b.sequence == a.sequence && b.frame == a.frame + 1
+    };
+    let count = (0..data.len().saturating_sub(1)).take_while(follows).take(PATH).count();
+    let odometry = Odometry::new(shown.model, shown.params, &shown.setup);
+    let motion = |i: usize| odometry.motion(&*data.image(i, 0)?, &*data.image(i + 1, 0)?);
+    let motions: Vec<Pose> = (0..count).map(motion).collect::<Result<_>>()?;
+    let place = |pose: Pose| [pose.position()[0], pose.position()[2]];
+    Ok(if count == 0 { Vec::new() } else { joined(&motions, scale).into_iter().map(place).collect() })
+}
+
+/// The middle of some numbers.
+fn median(values: impl Iterator<Item = f64>) -> f64 {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_unstable_by(f64::total_cmp);
+    values[values.len() / 2]
+}
