@@ -6,10 +6,8 @@ use super::{leave, page, tell_apart};
 /// A run with two steps, a validation, a warning and a snapshot, whose log ends in half a line.
 fn run(steps: &str) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
-    let log = format!(
-        "{{\"step\":1,\"loss\":0.5,\"flow\":1.0}}\n{{\"step\":2,\"loss\":null,\"flow\":1.0}}\n\
-         {{\"step\":3,\"loss\":0.25,\"flow\":1.0}}\n{{\"validated\":3,\"photometric\":0.125,\"abs_rel\":0.1875}}\n{{\"st"
-    );
+    let log = "{\"step\":1,\"loss\":0.5,\"flow\":1.0}\n{\"step\":2,\"loss\":null,\"flow\":1.0}\n\
+         {\"step\":3,\"loss\":0.25,\"flow\":1.0}\n{\"validated\":3,\"photometric\":0.125,\"abs_rel\":0.1875}\n{\"st";
     fs::write(folder.path().join("log.jsonl"), log).unwrap();
     let warning = r#"{"step":3,"warning":"disparity collapsed","begins":true,"figure":0.01,"limit":0.02}"#;
     fs::write(folder.path().join("warnings.jsonl"), warning).unwrap();
