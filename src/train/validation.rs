@@ -138,12 +138,13 @@ impl Run {
             let (abs_rel, a1) = (metrics.map(|m| m.abs_rel), metrics.map(|m| m.a1));
             let line = Validation { validated: step, photometric, warped, unwarped, best, abs_rel, a1 };
             log.write(&line)?;
-            tell(Event::Validated(&line));
             let shown = data.test.as_deref().unwrap_or(data.validation.as_ref());
             told("pictures", write_images(&self.folder, &predictor, shown, Some(step)), tell);
             let setup = self.config.setup();
             let shown = Shown { model: &self.trainer.model, params: &weights, setup, data: shown };
             told("views of the weights", self.view_validation(&shown, &batches[0]), tell);
+            // Whoever hears of it finds the pictures there.
+            tell(Event::Validated(&line));
         }
         self.notes.validated = step;
         self.notes.write(&self.folder, step)
