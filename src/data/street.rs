@@ -42,7 +42,7 @@ impl DataSource for Street {
     }
 
     fn intrinsics(&self, sample: usize) -> Intrinsics {
-        Street::intrinsics(self, self.locate(sample).0)
+        self.camera(self.locate(sample).0)
     }
 
     fn place(&self, sample: usize) -> Place {

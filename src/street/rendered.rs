@@ -191,7 +191,7 @@ impl Street {
     }
 
     /// The camera of a sequence. Panics if there is no such sequence.
-    pub fn intrinsics(&self, sequence: usize) -> Intrinsics {
+    pub fn camera(&self, sequence: usize) -> Intrinsics {
         self.sequences[sequence].intrinsics
     }
 

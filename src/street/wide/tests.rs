@@ -23,7 +23,7 @@ fn a_seed_fixes_every_picture_and_no_two_sequences_share_a_camera() {
         for frame in 0..3 {
             assert_eq!(a.frame(sequence, frame), b.frame(sequence, frame));
         }
-        assert!(sequence == 0 || a.intrinsics(sequence) != a.intrinsics(sequence - 1));
+        assert!(sequence == 0 || a.camera(sequence) != a.camera(sequence - 1));
     }
     assert_ne!(a.frame(0, 0), Street::render(&config(4), None).frame(0, 0));
 }
