@@ -313,7 +313,7 @@ impl RunConfig {
             auto_mask_delay: if reduced { scratch.auto_mask_delay } else { 0.0 },
             loss: LossConfig { min_depth, max_depth, ..scratch.loss },
             rotations: Rotations::default(),
-            pose_first: 0.5,
+            pose_first: 0.3,
             optim: match reduced {
                 true => OptimConfig { pose_rate: scratch.optim.rate, ..scratch.optim },
                 false => OptimConfig { encoder_rate: 5e-5, rate: 1e-4, pose_rate: 1e-3, ..scratch.optim },
@@ -486,7 +486,7 @@ mod tests {
         let optim = RunConfig::from_weights(Setup::of(Preset::Nano), 300).optim;
         assert_eq!((optim.encoder_rate, optim.rate, optim.pose_rate), (1e-3, 1e-3, 1e-3));
         let config = RunConfig::from_weights(Setup::of(Preset::Small), 300);
-        assert_eq!((config.plan().pose_first, config.plan().rotations.steps), (150, 0));
+        assert_eq!((config.plan().pose_first, config.plan().rotations.steps), (90, 0));
         let optim = config.optim;
         assert!(optim.encoder_rate == 5e-5 && optim.rate == 1e-4 && optim.pose_rate > optim.rate);
         assert_eq!(RunConfig::usual().plan().pose_first, 0);
