@@ -157,7 +157,7 @@ mod tests {
         assert_eq!(of(Sensor { gamma: 2.0, ..PLAIN }).get_pixel(10, 5).0, [25, 25, 64]);
         assert_eq!(of(Sensor { haze: [0.5, 100.0], ..PLAIN }).get_pixel(10, 5).0, [90, 90, 114]);
         let dark = of(Sensor { vignette: 0.5, ..PLAIN });
-        assert!(dark.get_pixel(0, 0).0[2] < 70 && dark.get_pixel(16, 8).0[2] > 126, "{:?}", dark.get_pixel(0, 0));
+        assert!(dark.get_pixel(0, 0).0[2] < 75 && dark.get_pixel(16, 8).0[2] > 126, "{:?}", dark.get_pixel(0, 0));
         // A blur keeps a ramp, but for its edges.
         let blurred = of(Sensor { blur: 1.0, ..PLAIN });
         assert_eq!((blurred.get_pixel(10, 5).0, blurred.get_pixel(0, 0).0), ([80, 80, 128], [2, 4, 128]));
@@ -181,7 +181,7 @@ mod tests {
         let mut sensors = Vec::new();
         for i in 1..=400u128 {
             sensors.push(Sensor::draw(random.chacha()));
-            assert_eq!(random.chacha().get_word_pos() - before, 21 * i);
+            assert_eq!(random.chacha().get_word_pos() - before, 23 * i);
         }
         let share = |of: &dyn Fn(&Sensor) -> bool| sensors.iter().filter(|s| of(s)).count();
         for drawn in [

@@ -57,7 +57,7 @@ pub struct LossConfig {
     pub auto_mask: bool,
     /// Standard deviation of the noise that decides between equal errors.
     pub tie_break: f64,
-    /// Weight of [`depth_error`](super::supervision::depth_error): supervision by known depth, where the data know it (the
+    /// Weight of [`depth_error`]: supervision by known depth, where the data know it (the
     /// street), with which predicted depth is in metres; 0, as published: none.
     pub depth_supervision: f64,
     /// Whether the sampling grid is made for the convention it is sampled with (pixel centres), instead of the
@@ -152,7 +152,7 @@ pub struct Loss<T: Float> {
     pub smoothness: f64,
     /// Share of pixels that auto-masking leaves in: those that a warped neighbour explains best.
     pub auto_mask: f64,
-    /// The distance to known depth ([`depth_error`](super::supervision::depth_error)), not weighted; 0 where none is asked
+    /// The distance to known depth ([`depth_error`]), not weighted; 0 where none is asked
     /// for.
     pub depth_error: f64,
 }

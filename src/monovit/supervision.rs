@@ -43,7 +43,7 @@ mod tests {
         for (found, expected) in gradient.data().iter().zip([1.0 / (6.0 * e), 0.0, -1.0 / 150.0, 0.0]) {
             assert!((found - expected).abs() < 1e-12, "{found} {expected}");
         }
-        let nothing = depth_error(&predicted, &Tensor::zeros(shape), [0.1, 100.0]);
+        let nothing = depth_error(&predicted.detach(), &Tensor::zeros(shape), [0.1, 100.0]);
         assert_eq!(nothing.value().item(), 0.0);
     }
 }

@@ -75,7 +75,7 @@ fn views_are_shown_and_none_is_read_from_outside() {
         {"kind":"Depth and its error","about":"<frame>","views":[
             {"file":"error.png","title":"Error","bar":["0","50 % and more"]},{"file":"../outside.png","title":"Outside"}]}]}"#;
     fs::write(place.join("validation.json"), list).unwrap();
-    fs::write(place.join("end.json"), "[3]").unwrap();
+    fs::write(place.join("end.json"), "3").unwrap();
     let run = Record::read(folder.path()).unwrap();
     let page = page::page(&[run], false, &[]);
     let expected = [
