@@ -55,13 +55,14 @@ impl Cuts {
     pub(in crate::ops) fn new([k, n]: [usize; 2], rows: usize, width: usize) -> Self {
         let small = k * n <= regime::size(SMALL);
         let pixels = regime::size(PIXELS[usize::from(!small)]);
-        let parts = (rows * width).div_ceil(pixels.max(1)).clamp(1, MOST).min(rows.max(1));
+        let parts = (rows * width).div_ceil(pixels.max(1)).clamp(1, regime::size(MOST)).min(rows.max(1));
         let row_step = rows.div_ceil(parts).max(1);
         let parts = rows.div_ceil(row_step).max(1);
         let pixels = (row_step * width).max(1);
         // Smaller blocks where there would be few, as long as each is worth handing over.
         let shared = (k * n * parts / CHUNKS).max(LEAST_AREA).max(LEAST_PRODUCTS / pixels);
-        let area = if small && parts >= MOST / 2 { k * n } else { AREA.max(PRODUCTS / pixels).min(shared) };
+        let area =
+            if small && parts >= regime::size(MOST) / 2 { k * n } else { AREA.max(PRODUCTS / pixels).min(shared) };
         // Columns evenly, in whole panels of registers; what remains of the area are rows.
         let panels = n.div_ceil(n.div_ceil(COLUMNS).max(1)).next_multiple_of(32);
         let n_step = regime::size(if n <= COLUMNS { n.max(1) } else { panels });
