@@ -20,9 +20,6 @@ use crate::cli::sizes::Sizes;
 pub struct Args {
     #[command(flatten)]
     sizes: Sizes,
-    /// Number of threads that the bound is for; this machine need not have them.
-    #[arg(long, value_name = "N", default_value_t = 16)]
-    threads: usize,
     /// Seed of the weights and of the pictures.
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -57,15 +54,14 @@ struct Scaling {
 /// Places that are printed.
 const SHOWN: usize = 20;
 
-pub fn run(Args { sizes, threads, seed }: &Args) -> Result<()> {
-    if *threads == 0 {
-        return Err(parallax::Error::setting("--threads", "at least 1"));
-    }
+/// Says the bound for as many threads as `--threads` says; this machine need not have so many processors.
+pub fn run(Args { sizes, seed }: &Args) -> Result<()> {
+    let threads = parallel::threads();
     let mut network = Network::new(sizes, *seed, None)?;
     // On one thread, which sees all the calls.
     let (done, cuts) = parallel::with_threads(1, || regime::record(|| network.once()));
     done?;
-    let scaling = bound(&cuts, *threads);
+    let scaling = bound(&cuts, threads);
     if sizes.json { super::super::print_json(&scaling) } else { print(&scaling) }
 }
 
