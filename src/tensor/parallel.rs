@@ -107,11 +107,11 @@ fn cut<T: Send>(
     }
     let _ = place;
     if stays(data.len().div_ceil(chunk), work) {
-        data.chunks_mut(chunk).enumerate().for_each(|(i, c)| f(i, c));
+        regime::inside(|| data.chunks_mut(chunk).enumerate().for_each(|(i, c)| f(i, c)));
     } else {
         // Whoever computes a chunk cuts it further as the thread would that hands it over.
         let largest = regime::largest();
-        in_pool(&mut || split(data, chunk, 0, &|i, c| regime::shrink(largest, || f(i, c))));
+        in_pool(&mut || split(data, chunk, 0, &|i, c| regime::inside(|| regime::shrink(largest, || f(i, c)))));
     }
 }
 
@@ -124,7 +124,7 @@ pub fn for_each(count: usize, work: usize, f: impl Fn(usize) + Sync + Send) {
 
 /// Nothing to be cut but the indices: the threads' machinery is compiled once for all that runs by index.
 fn indices(count: usize, work: usize, place: &'static Location<'static>, f: &(dyn Fn(usize) + Sync)) {
-    regime::note(place, count, None);
+    regime::note(place, count, None, work);
     cut(&mut vec![(); count], 1, work, place, &|i, _| f(i));
 }
 
@@ -141,7 +141,7 @@ pub fn map<R: Send>(count: usize, work: usize, f: impl Fn(usize) -> R + Sync + S
 pub fn for_each_chunk<T: Send>(data: &mut [T], chunk: usize, work: usize, f: impl Fn(usize, &mut [T]) + Sync + Send) {
     let chunk = chunk.max(1);
     let place = Location::caller();
-    regime::note(place, data.len().div_ceil(chunk), Some(!data.len().is_multiple_of(chunk)));
+    regime::note(place, data.len().div_ceil(chunk), Some(!data.len().is_multiple_of(chunk)), work);
     cut(data, chunk, work, place, &f);
 }
 
@@ -153,7 +153,7 @@ pub fn for_each_chunk<T: Send>(data: &mut [T], chunk: usize, work: usize, f: imp
 pub fn for_each_unit<T: Send>(data: &mut [T], unit: usize, work: usize, f: impl Fn(usize, &mut [T]) + Sync + Send) {
     assert!(data.len().is_multiple_of(unit.max(1)), "{} elements in units of {unit}", data.len());
     let place = Location::caller();
-    regime::note(place, data.len() / unit.max(1), None);
+    regime::note(place, data.len() / unit.max(1), None, work);
     cut(data, unit.max(1), work, place, &f);
 }
 

@@ -53,6 +53,10 @@ pub struct Cut {
     pub pieces: usize,
     /// Whether the last piece was shorter than the others, where that is known.
     pub rest: Option<bool>,
+    /// Elementary operations of all pieces together, as the kernel declares them; 0 for a loop inside a thread.
+    pub work: usize,
+    /// Whether it was made inside a piece of another one.
+    pub nested: bool,
 }
 
 impl Cut {
@@ -92,13 +96,31 @@ pub fn record<R>(f: impl FnOnce() -> R) -> (R, Vec<Cut>) {
 }
 
 /// Notes a cut.
-pub(crate) fn note(location: &'static Location<'static>, pieces: usize, rest: Option<bool>) {
+pub(crate) fn note(location: &'static Location<'static>, pieces: usize, rest: Option<bool>, work: usize) {
     CUTS.with_borrow_mut(|cuts| {
         if let Some(cuts) = cuts {
             let (op, algo) = RUNNING.get();
-            cuts.push(Cut { op, algo, location, pieces, rest });
+            cuts.push(Cut { op, algo, location, pieces, rest, work, nested: DEPTH.get() > 0 });
         }
     });
+}
+
+thread_local! {
+    /// How many cuts this thread is inside of.
+    static DEPTH: Cell<usize> = const { Cell::new(0) };
+}
+
+/// Runs the pieces of a cut on this thread: the cuts that they make are nested.
+pub(super) fn inside<R>(f: impl FnOnce() -> R) -> R {
+    struct Leave;
+    impl Drop for Leave {
+        fn drop(&mut self) {
+            DEPTH.set(DEPTH.get() - 1);
+        }
+    }
+    DEPTH.set(DEPTH.get() + 1);
+    let _leave = Leave;
+    f()
 }
 
 /// A bug planted at one cut, to see whether the checks notice: only in builds with `--cfg mutants`.
@@ -217,7 +239,7 @@ pub mod mutants {
 #[track_caller]
 pub fn blocks(range: Range<usize>, usual: usize) -> impl Iterator<Item = Range<usize>> {
     let block = size(usual).max(1);
-    note(Location::caller(), range.len().div_ceil(block), Some(!range.len().is_multiple_of(block)));
+    note(Location::caller(), range.len().div_ceil(block), Some(!range.len().is_multiple_of(block)), 0);
     let runs = range.clone().step_by(block).map(move |first| first..(first + block).min(range.end));
     #[cfg(mutants)]
     let runs = {
@@ -267,5 +289,17 @@ mod tests {
         assert_eq!(blocks(5..5, 4).count(), 0);
         let (_, cuts) = record(|| blocks(0..8, 4).count());
         assert_eq!((cuts[0].pieces, cuts[0].rest), (2, Some(false)));
+    }
+
+    #[test]
+    fn a_cut_says_its_work_and_whether_it_is_inside_another_one() {
+        let run = || {
+            parallel::with_threads(1, || {
+                parallel::for_each(3, 70, |_| parallel::for_each(2, 5, |_| ()));
+                parallel::for_each(1, 9, |_| ());
+            });
+        };
+        let found: Vec<_> = record(run).1.iter().map(|cut| (cut.pieces, cut.work, cut.nested)).collect();
+        assert_eq!(found, [(3, 70, false), (2, 5, true), (2, 5, true), (2, 5, true), (1, 9, false)]);
     }
 }

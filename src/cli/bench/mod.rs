@@ -5,6 +5,7 @@ mod breakdown;
 mod job;
 mod load;
 mod roofline;
+mod scaling;
 
 use std::path::PathBuf;
 
@@ -37,6 +38,8 @@ enum What {
     /// Compare each op of a training step with the machine's limits of arithmetic and memory.
     #[command(alias = "ops")]
     Roofline(Counted),
+    /// Bound the speed-up of a training step on many threads by how its work is cut. Nothing is timed.
+    Scaling(scaling::Args),
     /// Time training steps on a folder's files, and the same with their batches in memory, by turns.
     Load(load::Args),
     /// One convolution, forward: 3x3, batch 2, 3 channels of 320x320 to 16.
@@ -107,6 +110,7 @@ pub fn run(args: Args) -> Result<()> {
         What::Step(timed) => time_network(&timed, None),
         What::Infer { timed, precision } => time_network(&timed, Some(precision.checked()?)),
         What::Roofline(counted) => roofline::run(&counted),
+        What::Scaling(args) => scaling::run(&args),
         What::Load(args) => load::run(&args),
         What::Conv { iterations, json } => {
             report(&timing(job::measure(&mut Conv::new(), iterations, false)?, false)?, json)

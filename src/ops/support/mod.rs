@@ -8,3 +8,4 @@ pub(in crate::ops) mod row_products;
 pub(in crate::ops) mod squares;
 pub(in crate::ops) mod sums;
 pub(in crate::ops) mod tile;
+pub(in crate::ops) mod weight_blocks;

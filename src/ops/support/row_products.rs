@@ -2,12 +2,11 @@
 //! the weight. A linear layer is nothing else, and neither is a convolution whose window is one pixel.
 
 use super::epilogue::Finish;
-use super::put::begin_sum;
-use super::sums::sum_into;
+use super::weight_blocks::{Cuts, Pixels};
 use crate::ops::Tile;
 use crate::tensor::gemm::Rows;
-use crate::tensor::register_tile::{Gram, Line, Panels, Product};
-use crate::tensor::{Accum, Float, Precision, Tensor, parallel, regime};
+use crate::tensor::register_tile::{Line, Panels, Product};
+use crate::tensor::{Accum, Float, Precision, Tensor, parallel};
 
 /// Pixels as rows of channels.
 pub(in crate::ops) fn rows_of<T: Float>(x: &Tensor<T>) -> Rows<'_, T> {
@@ -64,34 +63,16 @@ fn line<T: Float>(x: Rows<'_, T>) -> Line<'_, T> {
     Line { data: x.data, step: x.row_stride, run: x.cols }
 }
 
-/// How many partial sums a weight gradient is made of: depends on the shape alone.
-fn partials(rows: usize) -> usize {
-    rows.div_ceil(regime::size(256)).clamp(1, 8)
-}
-
-/// Rows of a product that adds to a weight's gradient.
-const ROWS: usize = 512;
-
-/// `dw = x^T dy` in a fixed number of partial sums, added up in order: the same bits for any number of threads.
+/// `dw = x^T dy`, block by block.
 pub(in crate::ops) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, x: Rows<T>, g: Rows<T>) {
-    let (rows, k, n) = (x.rows, x.cols, g.cols);
-    let parts = partials(rows);
-    let step = rows.div_ceil(parts).max(1);
-    let product = |part: usize, out: &mut [T], accum| {
-        let (from, to) = ((part * step).min(rows), ((part + 1) * step).min(rows));
-        begin_sum(out, accum);
-        // Sums of sums, as far as rounding goes; and what a product reads stays in the cache.
-        for rows in regime::blocks(from..to, ROWS) {
-            let (first, count) = (rows.start, rows.len());
-            let (a_step, b_step) = (x.row_stride, g.row_stride);
-            let terms = &[(x.rows(first, count).data, g.rows(first, count).data)];
-            Gram { out, out_step: n, rows: k, cols: n, terms, count, a_step, b_step }.run();
-        }
+    let pixels = Pixels {
+        run: x.cols.max(1),
+        width: 1,
+        gapless: true,
+        a_step: x.row_stride,
+        b_step: g.row_stride,
+        a: |_: usize, row: usize| &x.data[row * x.row_stride..],
+        b: |_: usize, row: usize| &g.data[row * g.row_stride..],
     };
-    if parts == 1 {
-        return product(0, out, accum);
-    }
-    let sums =
-        parallel::map(parts, 2 * rows * k * n, |part| Tensor::build([k, n], |out| product(part, out, Accum::Replace)));
-    sum_into(out, accum, &sums);
+    Cuts::new([x.cols, g.cols], x.rows, 1).sum(out, accum, |block, sum| pixels.add(block, sum));
 }

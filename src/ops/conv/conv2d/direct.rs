@@ -10,8 +10,10 @@ use std::ops::Range;
 use super::geometry::Geometry;
 use super::parts::{Part, copy_pixels};
 use crate::ops::support::epilogue::Finish;
+use crate::ops::support::put::begin_sum;
+use crate::ops::support::weight_blocks::{Cuts, Pixels};
 use crate::tensor::pool::Buffer;
-use crate::tensor::register_tile::{Gram, Line, Panels, Product};
+use crate::tensor::register_tile::{Line, Panels, Product};
 use crate::tensor::{Accum, Float, Precision, parallel};
 
 /// The rows of one image that some rows of the output see, with their padding.
@@ -24,29 +26,13 @@ pub(in crate::ops) struct Band<T: Float> {
 impl<T: Float> Band<T> {
     /// What the output rows `rows` of image `b` see.
     fn new(g: &Geometry, x: &[Part<T>], b: usize, rows: Range<usize>) -> Self {
-        let (c, [height_in, width]) = (g.channels, g.size);
-        let cells = (g.out[1] - 1) * g.stride[1] + g.kernel[1];
-        let height = (rows.len() - 1) * g.stride[0] + (g.kernel[0] - 1) * g.dilation[0] + 1;
-        let line = cells * c;
+        let (height, line) = (height_under(g, rows.len()), line_of(g));
         let mut data = Buffer::stale(height * line);
-        let inside = g.padding[1].min(cells)..(g.padding[1] + width).min(cells);
         T::dispatch(
             #[inline(always)]
             || {
                 for (i, out) in data.chunks_exact_mut(line.max(1)).enumerate() {
-                    let Some(y) = g.padded(0, rows.start * g.stride[0] + i) else {
-                        out.fill(T::ZERO);
-                        continue;
-                    };
-                    let row = (b * height_in + y) * width;
-                    copy_pixels(&mut out[inside.start * c..inside.end * c], x, row, inside.len());
-                    for at in (0..inside.start).chain(inside.end..cells) {
-                        let out = &mut out[at * c..(at + 1) * c];
-                        match g.padded(1, at) {
-                            Some(column) => copy_pixels(out, x, row + column, 1),
-                            None => out.fill(T::ZERO),
-                        }
-                    }
+                    pad_row(out, g, x, b, rows.start * g.stride[0] + i);
                 }
             },
         );
@@ -56,6 +42,66 @@ impl<T: Float> Band<T> {
     /// The row under row `ky` of the windows of the band's output row `r`.
     pub(in crate::ops) fn line(&self, g: &Geometry, r: usize, ky: usize) -> &[T] {
         &self.data[(r * g.stride[0] + ky * g.dilation[0]) * self.line..][..self.line]
+    }
+}
+
+/// Rows of the padded image under the windows of neighbouring output rows.
+fn height_under(g: &Geometry, rows: usize) -> usize {
+    (rows - 1) * g.stride[0] + (g.kernel[0] - 1) * g.dilation[0] + 1
+}
+
+/// Numbers of a padded row.
+fn line_of(g: &Geometry) -> usize {
+    ((g.out[1] - 1) * g.stride[1] + g.kernel[1]) * g.channels
+}
+
+/// Row `at` of padded image `b`.
+#[inline(always)]
+fn pad_row<T: Float>(out: &mut [T], g: &Geometry, x: &[Part<T>], b: usize, at: usize) {
+    let (c, [height, width]) = (g.channels, g.size);
+    let Some(y) = g.padded(0, at) else { return out.fill(T::ZERO) };
+    let cells = out.len() / c;
+    let inside = g.padding[1].min(cells)..(g.padding[1] + width).min(cells);
+    let row = (b * height + y) * width;
+    copy_pixels(&mut out[inside.start * c..inside.end * c], x, row, inside.len());
+    for at in (0..inside.start).chain(inside.end..cells) {
+        let out = &mut out[at * c..(at + 1) * c];
+        match g.padded(1, at) {
+            Some(column) => copy_pixels(out, x, row + column, 1),
+            None => out.fill(T::ZERO),
+        }
+    }
+}
+
+/// All images of a batch with their padding: for products whose chunks each see all of them.
+pub(in crate::ops) struct Padded<T: Float> {
+    data: Buffer<T>,
+    line: usize,
+    /// Rows of a padded image.
+    height: usize,
+}
+
+impl<T: Float> Padded<T> {
+    /// Copies them.
+    pub(in crate::ops) fn new(g: &Geometry, x: &[Part<T>]) -> Self {
+        let (height, line) = (height_under(g, g.out[0]), line_of(g));
+        let mut data = Buffer::stale(g.batch * height * line);
+        if line > 0 {
+            let work = data.len();
+            parallel::for_each_unit(&mut data, line, work, |i, out| {
+                T::dispatch(
+                    #[inline(always)]
+                    || pad_row(out, g, x, i / height, i % height),
+                );
+            });
+        }
+        Padded { data, line, height }
+    }
+
+    /// What row `ky` of the windows sees of output row `row` of the whole batch, and all that follows.
+    pub(in crate::ops) fn from(&self, g: &Geometry, row: usize, ky: usize) -> &[T] {
+        let at = row / g.out[0] * self.height + row % g.out[0] * g.stride[0] + ky * g.dilation[0];
+        &self.data[at * self.line..]
     }
 }
 
@@ -107,37 +153,21 @@ pub(super) fn convolve<T: Float>(
     });
 }
 
-/// Whether dw is cheaper summed as its transpose: registers are filled along the rows of the sum.
-pub(super) fn is_better_transposed(g: &Geometry) -> bool {
-    let run = g.kernel[1] * g.channels;
-    g.out_channels * run.div_ceil(16) < run * g.out_channels.div_ceil(16)
-}
-
-/// What some output rows of the batch add to dw, `[patch, out]`, or to its transpose.
-pub(super) fn add_weight_gradient<T: Float>(
-    sum: &mut [T],
-    g: &Geometry,
-    x: &[Part<T>],
-    dy: &[T],
-    rows: Range<usize>,
-    transposed: bool,
-) {
+/// dw, block by block.
+pub(super) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: &[Part<T>], dy: &[T]) {
     let (n, width) = (g.out_channels, g.out[1]);
-    let (step, run) = (g.stride[1] * g.channels, g.kernel[1] * g.channels);
-    for_each_band(g, x, rows, |band, b, rows| {
-        let dy = &dy[(b * g.out[0] + rows.start) * width * n..];
-        let dy: Vec<&[T]> = dy.chunks_exact((width * n).max(1)).take(rows.len()).collect();
-        for ky in 0..g.kernel[0] {
-            let lines = (0..rows.len()).map(|r| band.line(g, r, ky));
-            if transposed {
-                let terms: Vec<_> = dy.iter().copied().zip(lines).collect();
-                let (out, out_step) = (&mut sum[ky * run..], g.patch());
-                Gram { out, out_step, rows: n, cols: run, terms: &terms, count: width, a_step: n, b_step: step }.run();
-            } else {
-                let terms: Vec<_> = lines.zip(dy.iter().copied()).collect();
-                let (out, out_step) = (&mut sum[ky * run * n..], n);
-                Gram { out, out_step, rows: run, cols: n, terms: &terms, count: width, a_step: step, b_step: n }.run();
-            }
-        }
-    });
+    if out.is_empty() || dy.is_empty() {
+        return begin_sum(out, accum);
+    }
+    let padded = Padded::new(g, x);
+    let pixels = Pixels {
+        run: g.kernel[1] * g.channels,
+        width,
+        gapless: false,
+        a_step: g.stride[1] * g.channels,
+        b_step: n,
+        a: |ky: usize, row: usize| padded.from(g, row, ky),
+        b: |_: usize, row: usize| &dy[row * width * n..],
+    };
+    Cuts::new([g.patch(), n], g.rows(), width).sum(out, accum, |block, sum| pixels.add(block, sum));
 }

@@ -1,5 +1,7 @@
 //! The three products of a convolution, tile by tile: outputs, the gradient of the input, the gradient of the weights.
 
+use std::ops::Range;
+
 use super::direct;
 use super::geometry::{Beyond, Geometry, Path};
 use super::parts::{Part, in_one_piece, whole};
@@ -169,26 +171,39 @@ pub(in crate::ops) fn border_gradient<T: Float>(out: &mut [T], g: &Geometry, t: 
         .filter(|&(y, x)| is_border(y, x))
         .collect();
     let (patch, c, image) = (padded.patch(), g.channels, t.size[0] * t.size[1] * t.channels);
-    let work = 2 * g.batch * positions.len() * patch * c;
-    parallel::for_each_unit(out, g.size[0] * g.size[1] * c, work, |b, out| {
-        let mut patches = Buffer::stale(positions.len() * patch);
-        let mut sums = Buffer::stale(positions.len() * c);
+    if c == 0 || positions.is_empty() {
+        return;
+    }
+    // Sums of all positions of all images, some at a time: many pieces, however few images there are.
+    let count = positions.len();
+    let mut sums = Buffer::stale(g.batch * count * c);
+    let (block, work) = (g.tile.or(BORDER), 2 * sums.len() * patch);
+    parallel::for_each_chunk(&mut sums, block * c, work, |i, sums| {
+        let rows = sums.len() / c;
+        let mut patches = Buffer::stale(rows * patch);
         for group in 0..g.groups {
-            for (&(y, x), p) in positions.iter().zip(patches.chunks_exact_mut(patch)) {
+            for (at, p) in (i * block..).zip(patches.chunks_exact_mut(patch)) {
+                let (b, (y, x)) = (at / count, positions[at % count]);
                 gather_patch(&padded, &dy[b * image..(b + 1) * image], y, x, group, p);
             }
             let (first, cg) = (group * g.group_in(), g.group_in());
             let weights = Rows::columns(turned, patch, c, first, cg);
-            let patches = Rows::dense(&patches, positions.len(), patch);
-            gemm(RowsMut::columns(&mut sums, positions.len(), c, first, cg), Accum::Replace, patches, weights, T::ONE);
+            let patches = Rows::dense(&patches, rows, patch);
+            gemm(RowsMut::columns(sums, rows, c, first, cg), Accum::Replace, patches, weights, T::ONE);
         }
-        for (&(y, x), sum) in positions.iter().zip(sums.chunks_exact(c)) {
+    });
+    let work = sums.len();
+    parallel::for_each_unit(out, g.size[0] * g.size[1] * c, work, |b, out| {
+        for (&(y, x), sum) in positions.iter().zip(sums[b * count * c..].chunks_exact(c)) {
             let (Some(y), Some(x)) = (g.padded(0, y), g.padded(1, x)) else { continue };
             let to = (y * g.size[1] + x) * c;
             out[to..to + c].iter_mut().zip(sum).for_each(|(d, &s)| *d += s);
         }
     });
 }
+
+/// Positions of the border that are computed together.
+const BORDER: usize = 64;
 
 /// The patch of one output pixel, for one group.
 fn gather_patch<T: Float>(g: &Geometry, image: &[T], oy: usize, ox: usize, group: usize, patch: &mut [T]) {
@@ -213,69 +228,92 @@ pub(in crate::ops) fn weights_of<T: Float>(g: &Geometry, first: usize, channels:
     out
 }
 
-/// dx where it is no convolution (strided): the gradients of patches, added to the pixels they were copied from.
-/// Patches overlap, so an image belongs to one thread.
+/// dx where it is no convolution (strided): the gradients of patches, added to the pixels they were copied from. A
+/// chunk owns some rows of dx, and computes of the patches what lies in them.
 fn scatter<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, dy: &[T], w: &[T]) {
-    let (c, cg, n, ng, patch, width) = (g.channels, g.group_in(), g.out_channels, g.group_out(), g.patch(), g.out[1]);
-    let work = 2 * g.rows() * width * patch * n;
-    parallel::for_each_unit(out, g.size[0] * g.size[1] * c, work, |b, out| {
+    let (n, width, line) = (g.out_channels, g.out[1], g.size[1] * g.channels);
+    if out.is_empty() || dy.is_empty() {
+        return begin_sum(out, accum);
+    }
+    let work = 2 * g.rows() * width * g.patch() * n;
+    // About as many numbers as a tile of the output has; few rows where there are few in all.
+    let usual = ((1 << 14) / line).clamp(1, (g.batch * g.size[0]).div_ceil(64)).next_multiple_of(g.stride[0]);
+    let tile = g.tile.or(usual);
+    parallel::for_each_chunk(out, tile * line, work, |i, out| {
         begin_sum(out, accum);
-        let tile = g.tile().min(g.out[0]).max(1);
-        let mut patches = Buffer::stale(tile * width * patch);
-        for first in (0..g.out[0]).step_by(tile) {
-            let rows = tile.min(g.out[0] - first);
-            let pixels = rows * width;
-            let dy = &dy[(b * g.out[0] + first) * width * n..][..pixels * n];
-            for group in 0..g.groups {
-                let weights = Rows::columns(w, patch, n, group * ng, ng).t();
-                let patches = &mut patches[..pixels * patch];
-                let dy = Rows::columns(dy, pixels, n, group * ng, ng);
-                gemm(RowsMut::dense(patches, pixels, patch), Accum::Replace, dy, weights, T::ONE);
-                for (pixel, p) in patches.chunks_exact(patch).enumerate() {
-                    let (oy, ox) = (first + pixel / width, pixel % width);
-                    for (k, p) in p.chunks_exact(cg).enumerate() {
-                        if let (Some(iy), Some(ix)) =
-                            (g.source(0, oy, k / g.kernel[1]), g.source(1, ox, k % g.kernel[1]))
-                        {
-                            let to = (iy * g.size[1] + ix) * c + group * cg;
-                            out[to..to + cg].iter_mut().zip(p).for_each(|(d, &p)| *d += p);
-                        }
-                    }
-                }
-            }
+        let mut first = i * tile;
+        // Image by image.
+        let mut rest = out;
+        while !rest.is_empty() {
+            let (b, y) = (first / g.size[0], first % g.size[0]);
+            let rows = (rest.len() / line).min(g.size[0] - y);
+            let (mine, others) = rest.split_at_mut(rows * line);
+            let image = g.out[0] * width * n;
+            scatter_rows(mine, g, y..y + rows, &dy[b * image..(b + 1) * image], w);
+            (rest, first) = (others, first + rows);
         }
     });
 }
 
-/// dw: the sum over pixels of patch^T dy, in a fixed number of partial sums.
+/// Adds to some rows of dx of one image what the patches of its dy have there.
+fn scatter_rows<T: Float>(out: &mut [T], g: &Geometry, rows: Range<usize>, dy: &[T], w: &[T]) {
+    let (c, cg, n, ng, width) = (g.channels, g.group_in(), g.out_channels, g.group_out(), g.out[1]);
+    let (run, line) = (g.kernel[1] * cg, g.size[1] * c);
+    let seen = |oy: usize, ky: usize| g.source(0, oy, ky).filter(|y| rows.contains(y));
+    for ky in 0..g.kernel[0] {
+        let mut oy = 0;
+        while oy < g.out[0] {
+            let count = (oy..g.out[0]).take_while(|&oy| seen(oy, ky).is_some()).count();
+            if count == 0 {
+                oy += 1;
+                continue;
+            }
+            let pixels = count * width;
+            let mut products = Buffer::stale(pixels * run);
+            for group in 0..g.groups {
+                let weights = Rows::columns(&w[ky * run * n..][..run * n], run, n, group * ng, ng).t();
+                let dy = Rows::columns(&dy[oy * width * n..][..pixels * n], pixels, n, group * ng, ng);
+                gemm(RowsMut::dense(&mut products, pixels, run), Accum::Replace, dy, weights, T::ONE);
+                T::dispatch(
+                    #[inline(always)]
+                    || {
+                        for (oy, products) in (oy..).zip(products.chunks_exact(width * run)) {
+                            let Some(y) = seen(oy, ky) else { continue };
+                            let out = &mut out[(y - rows.start) * line..][..line];
+                            for (ox, p) in products.chunks_exact(run).enumerate() {
+                                for (kx, p) in p.chunks_exact(cg).enumerate() {
+                                    let Some(x) = g.source(1, ox, kx) else { continue };
+                                    put(Accum::Add, out[x * c + group * cg..][..cg].iter_mut().zip(p.iter().copied()));
+                                }
+                            }
+                        }
+                    },
+                );
+            }
+            oy += count;
+        }
+    }
+}
+
+/// dw: the sum over pixels of patch^T dy.
 pub(in crate::ops) fn weight_gradient<T: Float>(out: &mut [T], accum: Accum, g: &Geometry, x: &[Part<T>], dy: &[T]) {
+    if g.is_direct() {
+        return direct::weight_gradient(out, accum, g, x, dy);
+    }
+    // Of im2col matrices, in a fixed number of partial sums.
     let (n, patch, tile) = (g.out_channels, g.patch(), g.tile());
     let tiles = g.rows().div_ceil(tile);
     let parts = tiles.clamp(1, PARTS);
-    let transposed = g.is_direct() && direct::is_better_transposed(g);
     let mut room = None;
-    let image = if g.is_direct() { &[] } else { in_one_piece(g, x, &mut room) };
+    let image = in_one_piece(g, x, &mut room);
     let partial = |part: usize, sum: &mut [T]| {
         sum.fill(T::ZERO);
         for first in (part * tiles / parts..(part + 1) * tiles / parts).map(|t| t * tile) {
-            let rows = tile.min(g.rows() - first);
-            if g.is_direct() {
-                direct::add_weight_gradient(sum, g, x, dy, first..first + rows, transposed);
-            } else {
-                add_weight_gradient(sum, g, image, dy, first, rows);
-            }
+            add_weight_gradient(sum, g, image, dy, first, tile.min(g.rows() - first));
         }
     };
     let work = 2 * g.rows() * g.out[1] * patch * n;
     let sums = parallel::map(parts, work, |part| Tensor::build([patch * n], |sum| partial(part, sum)));
-    if transposed {
-        let mut sum = Buffer::stale(patch * n);
-        sum_into(&mut sum, Accum::Replace, &sums);
-        for (k, row) in out.chunks_exact_mut(n).enumerate() {
-            put(accum, row.iter_mut().zip(sum[k..].iter().step_by(patch).copied()));
-        }
-        return;
-    }
     sum_into(out, accum, &sums);
 }
 
@@ -292,5 +330,5 @@ fn add_weight_gradient<T: Float>(sum: &mut [T], g: &Geometry, x: &[T], dy: &[T],
     }
 }
 
-/// Partial sums of a weight gradient.
-pub(in crate::ops) const PARTS: usize = 4;
+/// Partial sums of a weight gradient by im2col.
+const PARTS: usize = 4;

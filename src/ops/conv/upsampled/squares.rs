@@ -4,16 +4,15 @@
 //! 2y + p + 1 therefore sees two rows of the small image: y - 1 and twice y for p = 0, twice y and y + 1 for p = 1. The
 //! same holds for columns. The weights of what is seen twice are added once, before anything is multiplied.
 
-use crate::ops::conv::conv2d::direct::for_each_band;
+use crate::ops::conv::conv2d::direct::{Padded, for_each_band};
 use crate::ops::conv::conv2d::geometry::{Beyond, Geometry};
 use crate::ops::conv::conv2d::kernel;
-use crate::ops::conv::conv2d::kernel::PARTS;
 use crate::ops::conv::conv2d::parts::whole;
 use crate::ops::support::epilogue::Finish;
-use crate::ops::support::sums::sum_into;
+use crate::ops::support::weight_blocks::{Cuts, Pixels};
 use crate::tensor::pool::Buffer;
-use crate::tensor::register_tile::{Gram, Line, Panels, Product};
-use crate::tensor::{Accum, Float, Precision, Tensor, parallel};
+use crate::tensor::register_tile::{Line, Panels, Product};
+use crate::tensor::{Accum, Float, Precision, parallel};
 
 /// The places in a square, (row, column).
 pub(super) const PHASES: [[usize; 2]; 4] = [[0, 0], [0, 1], [1, 0], [1, 1]];
@@ -132,53 +131,43 @@ fn turned<T: Float>(g: &Geometry, w: &[T]) -> Buffer<T> {
     out
 }
 
-/// dw, in a fixed number of partial sums: first of the 2x2 windows, then each of their weights counts for all those
-/// that were added to make it.
+/// dw: first of the 2x2 windows, block by block; then each of their weights counts for all those that were added to
+/// make it.
 pub(super) fn weight_gradient<T: Float>(out: &mut [T], g: &Geometry, x: &[T], dy: &[T]) {
-    let (c, n, width, tile) = (g.channels, g.out_channels, g.out[1], tile(g));
+    let (c, n, width) = (g.channels, g.out_channels, g.out[1]);
     if c * n == 0 {
         return;
     }
-    let tiles = g.rows().div_ceil(tile);
-    let parts = tiles.clamp(1, PARTS);
-    let half = 2 * c * n;
-    let partial = |part: usize, sum: &mut [T]| {
-        sum.fill(T::ZERO);
-        for first in (part * tiles / parts..(part + 1) * tiles / parts).map(|t| t * tile) {
-            let rows = first..(first + tile).min(g.rows());
-            for_each_band(g, &whole(g, x), rows, |band, b, rows| {
-                for (&[py, px], sum) in PHASES.iter().zip(sum.chunks_exact_mut(2 * half)) {
-                    for (t, out) in sum.chunks_exact_mut(half).enumerate() {
-                        let terms = rows.clone().enumerate().map(|(r, y)| {
-                            let dy = &dy[((b * 2 * g.out[0] + 2 * y + py) * 2 * width + px) * n..];
-                            (&band.line(g, r, py + t)[px * c..], dy)
-                        });
-                        let terms: Vec<_> = terms.collect();
-                        let (a_step, b_step) = (c, 2 * n);
-                        let gram = Gram {
-                            out,
-                            out_step: n,
-                            rows: 2 * c,
-                            cols: n,
-                            terms: &terms,
-                            count: width,
-                            a_step,
-                            b_step,
-                        };
-                        gram.run();
-                    }
+    let padded = Padded::new(g, &whole(g, x));
+    // A row of one of the four windows sees two pixels that follow each other.
+    let place = |of: usize| (PHASES[of / 2], of % 2);
+    let pixels = Pixels {
+        run: 2 * c,
+        width,
+        gapless: false,
+        a_step: c,
+        b_step: 2 * n,
+        a: |of: usize, row: usize| {
+            let ([py, px], t) = place(of);
+            &padded.from(g, row, py + t)[px * c..]
+        },
+        b: |of: usize, row: usize| {
+            let ([py, px], _) = place(of);
+            &dy[((2 * row + py) * 2 * width + px) * n..]
+        },
+    };
+    let block = c * n;
+    let mut sum = Buffer::stale(PHASES.len() * TAPS * block);
+    let cuts = Cuts::new([PHASES.len() * TAPS * c, n], g.rows(), width);
+    cuts.sum(&mut sum, Accum::Replace, |block, sum| pixels.add(block, sum));
+    parallel::for_each_unit(out, block, sum.len(), |k, out| {
+        out.fill(T::ZERO);
+        for (&phase, sum) in PHASES.iter().zip(sum.chunks_exact(TAPS * block)) {
+            for_each_tap(phase, |tap, t| {
+                if tap == k {
+                    add(out, &sum[t * block..][..block]);
                 }
             });
         }
-    };
-    let size = PHASES.len() * 2 * half;
-    let work = 2 * g.rows() * width * size;
-    let sums = parallel::map(parts, work, |part| Tensor::build([size], |sum| partial(part, sum)));
-    let mut sum = Buffer::stale(size);
-    sum_into(&mut sum, Accum::Replace, &sums);
-    out.fill(T::ZERO);
-    let block = c * n;
-    for (phase, sum) in PHASES.iter().zip(sum.chunks_exact(TAPS * block)) {
-        for_each_tap(*phase, |k, t| add(&mut out[k * block..][..block], &sum[t * block..][..block]));
-    }
+    });
 }
