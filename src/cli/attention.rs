@@ -63,7 +63,7 @@ impl FromStr for Point {
     }
 }
 
-/// What `--json` says.
+/// Figures of `--json`.
 #[derive(Serialize)]
 struct Written {
     image: PathBuf,

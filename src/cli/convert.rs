@@ -41,7 +41,7 @@ pub struct Args {
     /// metres, which is measured on rendered streets. Says how much rounding changes depth.
     #[arg(long, conflicts_with_all = ["allow_partial", "height", "width", "averaged"])]
     ship: bool,
-    /// What the shipped weights were trained on, in words [default: as the run's configuration says].
+    /// Name of the world that the shipped weights were trained on [default: as the run's configuration says].
     #[arg(long, value_name = "WORDS", requires = "ship")]
     world: Option<String>,
     /// With --ship: on how many rendered streets metres are measured, with each of ten cameras.

@@ -12,7 +12,7 @@ use rand_chacha::ChaCha8Rng;
 use super::augment::{coin, uniform};
 use crate::random::Random;
 
-/// What a sensor does to the pictures of a sample.
+/// Changes that a sensor makes to the pictures of a sample.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Sensor {
     /// Response of each channel: `255 gain (x / 255)^gamma`, and what haze leaves of it.

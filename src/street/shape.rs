@@ -68,7 +68,7 @@ impl Shape {
         }
     }
 
-    /// The same solid `by` metres farther to the right.
+    /// This solid, `by` metres farther to the right.
     pub(crate) fn sideways(self, by: f64) -> Shape {
         let right = |[x, y, z]: [f64; 3]| [x + by, y, z];
         match self {

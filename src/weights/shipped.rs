@@ -16,7 +16,7 @@ use crate::error::{Error, Result};
 use crate::formats::TensorFile;
 use crate::formats::safetensors::{self, Numbers};
 
-/// What the weights inside the program are called wherever weights are named. A file or folder of that name is
+/// Name of the weights inside the program wherever weights are named. A file or folder of that name is
 /// `./shipped`.
 pub const SHIPPED: &str = "shipped";
 
@@ -29,7 +29,7 @@ const KEY: &str = "parallax_origin";
 /// Where weights come from, and how their depths become metres.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Origin {
-    /// What they were trained on, in words.
+    /// Name of the world that they were trained on.
     pub world: String,
     /// The steps of the training.
     pub steps: u64,
@@ -73,7 +73,7 @@ pub struct Metres {
 }
 
 impl Metres {
-    /// What depths of a picture of this camera are multiplied by to be metres.
+    /// Factor that makes depths of a picture of this camera metres.
     pub fn factor_for(&self, camera: Intrinsics) -> f64 {
         let wide = (camera.fx / self.camera.fx).powf(self.by_width);
         let high = (camera.fy / self.camera.fy).powf(self.by_height);
@@ -82,7 +82,7 @@ impl Metres {
 }
 
 impl Origin {
-    /// What the weights were trained on, and for how long.
+    /// Origin of the weights: the world, and for how long they were trained.
     pub fn in_words(&self) -> String {
         format!("{}, {} steps", self.world, self.steps)
     }
@@ -127,7 +127,7 @@ impl Origin {
         Ok(HashMap::from([(KEY.into(), text)]))
     }
 
-    /// What the metadata of a file of weights says, if anything.
+    /// The metadata of a file of weights, if it has any.
     ///
     /// # Errors
     /// If it says something that cannot be read or used.

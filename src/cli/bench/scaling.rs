@@ -47,7 +47,7 @@ struct Scaling {
     work: f64,
     /// At most so many times as fast as on one thread.
     bound: f64,
-    /// What costs the most time beyond its share of the work first.
+    /// Places in the source, the one that costs the most time beyond its share of the work first.
     places: Vec<Place>,
 }
 

@@ -14,13 +14,13 @@ use serde::Serialize;
 
 use super::Args;
 
-/// What `--json` says.
+/// Figures of `--json`.
 #[derive(Serialize)]
 struct Shipped<'a> {
     file: &'a Path,
     bytes: u64,
     origin: &'a Origin,
-    /// What rounding does to depth, relatively.
+    /// Relative change of depth by rounding.
     rounding_mean: f64,
     rounding_largest: f64,
     abs_rel_before_rounding: f64,
@@ -124,7 +124,7 @@ impl Shipped<'_> {
     }
 }
 
-/// What a run was trained on, in words.
+/// Name of the world that a run was trained on.
 fn world(config: &RunConfig) -> String {
     match &config.data[..] {
         STREET => return format!("the program's own street, seed {}", config.seed),

@@ -78,7 +78,7 @@ impl<'a> Scaling<'a> {
         }
     }
 
-    /// What a picture's depths are multiplied by; `map` is its inverse depth as predicted.
+    /// Factor on a picture's depths; `map` is its inverse depth as predicted.
     ///
     /// # Errors
     /// If the camera's height decides, and no road is seen.

@@ -56,7 +56,7 @@ impl Pattern {
         }
     }
 
-    /// What `{}` stands for in a name, if it has this form.
+    /// The part of a name that `{}` stands for, if the name has this form.
     fn variable<'a>(&self, name: &'a str) -> Option<&'a str> {
         name.strip_prefix(&self.before)?.strip_suffix(&self.after).filter(|variable| !variable.is_empty())
     }

@@ -1,4 +1,4 @@
-//! What stands where in a wide sequence.
+//! The layout of a wide sequence: where everything stands.
 
 use super::super::draw::Draw;
 use super::super::houses;
@@ -21,7 +21,7 @@ enum Kind {
     Motorway,
 }
 
-/// What a side of the road has.
+/// The equipment of a side of the road.
 struct Side {
     side: f64,
     half: f64,
@@ -245,7 +245,7 @@ fn line(world: &mut World, draw: &mut Draw, s: &Side) {
     });
 }
 
-/// What drives: ahead at about the camera's speed, and towards it.
+/// Traffic: ahead at about the camera's speed, and towards it.
 fn traffic(world: &mut World, draw: &mut Draw, frames: usize, half: f64, motorway: bool) {
     let heavy = if motorway { 0.3 } else { 0.1 };
     let mut z = draw.range(7.0, 30.0);

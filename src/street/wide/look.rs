@@ -1,4 +1,4 @@
-//! What the surfaces of the wide world look like where the embedded street has none of the kind: paint and glass that
+//! Looks of the wide world's surfaces where the embedded street has none of the kind: paint and glass that
 //! mirror the sky, the ground from the road to the fields, rails.
 
 use super::super::surface::{Car, Point, Road};
@@ -15,7 +15,7 @@ pub(crate) enum Look {
     Cabin(Car, f32),
     /// A smooth surface with a faint grain: metal, cloth, skin.
     Smooth(Colour),
-    /// The same with a row of windows between two heights above the ground, `pitch` apart: a bus.
+    /// A bus: the paint with a row of windows between two heights above the ground, `pitch` apart.
     Windows { paint: Colour, low: f32, high: f32, pitch: f32 },
 }
 

@@ -1,4 +1,4 @@
-//! What stands beside the road: lamps, signs, rails, hedges, fences, trees and the lines of them that close the view.
+//! Things beside the road: lamps, signs, rails, hedges, fences, trees and the lines of them that close the view.
 
 use super::super::draw::Draw;
 use super::super::light::GROUND;

@@ -98,7 +98,7 @@ impl<T: Float> Padded<T> {
         Padded { data, line, height }
     }
 
-    /// What row `ky` of the windows sees of output row `row` of the whole batch, and all that follows.
+    /// The numbers that row `ky` of the windows sees of output row `row` of the whole batch, and all that follow.
     pub(in crate::ops) fn from(&self, g: &Geometry, row: usize, ky: usize) -> &[T] {
         let at = row / g.out[0] * self.height + row % g.out[0] * g.stride[0] + ky * g.dilation[0];
         &self.data[at * self.line..]
