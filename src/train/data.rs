@@ -26,7 +26,7 @@ pub fn is_rendered(data: &str) -> bool {
 const STREET_1: &str = "street-1";
 
 /// Sequences of `street-2` (training, validation, test), and frames of each.
-const WIDE_SEQUENCES: [usize; 3] = [1200, 16, 24];
+const WIDE_SEQUENCES: [usize; 3] = [2400, 16, 24];
 const WIDE_FRAMES: usize = 4;
 
 /// Sequences of the embedded street: training, validation, test. Many short drives: a street more teaches more than a
