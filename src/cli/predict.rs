@@ -1,6 +1,6 @@
 //! `parallax predict`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use image::RgbImage;
@@ -15,7 +15,7 @@ use parallax::eval::predictor::Predictor;
 use parallax::formats::atomic::check_writable;
 use parallax::formats::depth_png::write_depth_png;
 use parallax::formats::npy::write_npy;
-use parallax::formats::picture::read_picture;
+use parallax::formats::picture::read_picture_with_lens;
 use parallax::formats::ply::write_point_cloud;
 use parallax::formats::png::write_png;
 use parallax::report::colormap::disparity_to_image;
@@ -24,6 +24,7 @@ use parallax::{Error, Result};
 use serde::Serialize;
 
 use super::film::FilmArgs;
+use super::lens::{self, Flags, Lens, Told};
 use super::progress::Progress;
 use super::sizes::Numbers;
 
@@ -62,8 +63,9 @@ pub struct Args {
     ///
     /// weights, trained_on (words, or null), height, width (of the network), unit ("metres" or
     /// "relative"), pictures: [{input, outputs: {disparity, depth, inverse_depth, points}, width, height,
-    /// factor, median_depth, doubt (words, or null), seconds}], failed: [{input, error}], seconds (since
-    /// the program began).
+    /// view (across, in degrees), view_by ("flag", "camera_toml", "exif" or "assumed"), factor,
+    /// median_depth, doubt (words, or null), seconds}], failed: [{input, error}], seconds (since the
+    /// program began).
     #[arg(long, verbatim_doc_comment)]
     json: bool,
     /// Also NAME_depth.png: 16-bit grey, depth * 256, as KITTI stores it.
@@ -101,11 +103,11 @@ pub struct Args {
     /// Metres by the camera's known height over the road (KITTI: 1.65), for every picture on its own.
     #[arg(long, value_name = "METRES", group = "unit", help_heading = "Scale (one of)", value_parser = above_zero)]
     camera_height: Option<f64>,
-    /// Focal lengths and principal point, in pixels of the pictures [default: from --fov].
+    /// Focal lengths and principal point, in pixels of the pictures [default: see Camera below].
     #[arg(long, value_name = "FX,FY,CX,CY", group = "camera", help_heading = CAMERA)]
     #[arg(value_parser = super::pinhole)]
     intrinsics: Option<[f64; 4]>,
-    /// Horizontal field of view in degrees, for square pixels around the middle [default: 81.5, KITTI's].
+    /// Horizontal field of view in degrees, for square pixels around the middle [default: see Camera below].
     #[arg(long, value_name = "DEGREES", group = "camera", help_heading = CAMERA)]
     #[arg(value_parser = field_of_view)]
     fov: Option<f64>,
@@ -133,10 +135,9 @@ What is written:
 
 Scale:
   Shipped weights speak in metres for a camera that hangs 1.65 m above the road, as their training's
-  did; at twice the height true depths are twice as large. The view across is taken to be 81.5 degrees:
-  --fov or --intrinsics correct the metres for another lens, by exponents that were measured on
-  rendered streets (what looks the same through a longer lens is further away). With another --height
-  or --width than the network's own, depths have no unit.
+  did; at twice the height true depths are twice as large. Metres are corrected for the view across,
+  by exponents that were measured on rendered streets (what looks the same through a longer lens is
+  further away). With another --height or --width than the network's own, depths have no unit.
   Other weights that learnt from one moving camera know depth up to a factor. --camera-height finds it
   on the road: every pixel of the prediction has a tangent plane; where that is level to 5 degrees it is
   ground, and the median distance of these planes from the camera is the camera's height h in the
@@ -145,8 +146,10 @@ Scale:
   picture; for the frames of one video their median, given as --scale, is steadier.
 
 Camera:
-  Without --intrinsics or --fov it is KITTI's: a focal length of 0.58 of the width. With another lens
-  points lie too far to the sides or too little, and metres are off.
+  The first of these that is there: --intrinsics or --fov; a camera.toml in the picture's folder or one
+  above it up to the input (fov, or width, height, fx, fy, cx, cy in pixels); the focal length in the
+  picture's EXIF data, unless it was cut to another aspect since; KITTI's, a view of 81.5 degrees across.
+  With the wrong lens points lie too far to the sides or too little, and metres are off.
 
 Exit status:
   0 all pictures are done; 1 something failed: what, is said on standard error, and the other
@@ -164,9 +167,16 @@ fn above_zero(text: &str) -> Result<f64, String> {
     number.ok_or_else(|| "expected a number above 0".to_owned())
 }
 
-fn field_of_view(text: &str) -> Result<f64, String> {
+pub(super) fn field_of_view(text: &str) -> Result<f64, String> {
     let number = text.parse::<f64>().ok().filter(|x| (1.0..=175.0).contains(x));
     number.ok_or_else(|| "expected degrees from 1 to 175".to_owned())
+}
+
+impl Args {
+    /// The camera of a picture of a size, `[width, height]`, whose EXIF data tell a focal length of `focal` pixels.
+    fn lens(&self, picture: &Path, size: [f64; 2], focal: Option<f64>) -> Result<Lens> {
+        Flags { intrinsics: self.intrinsics, fov: self.fov }.lens(&self.inputs, picture, size, focal)
+    }
 }
 
 /// What was done, as JSON.
@@ -189,6 +199,9 @@ struct Done {
     outputs: Outputs,
     width: usize,
     height: usize,
+    /// The camera's view across in degrees, and who told it.
+    view: f64,
+    view_by: Told,
     /// What depths were multiplied by.
     factor: f64,
     /// The median of the depths, after that.
@@ -244,6 +257,11 @@ pub fn run(args: Args) -> Result<()> {
         progress.set(i as u64 + 1, "");
     }
     progress.finish();
+    if let Some(views) = lens::in_words(&done.iter().map(|p: &Done| (p.view_by, p.view)).collect::<Vec<_>>())
+        && (scaling.unit() == "metres" || args.ply)
+    {
+        note!("{views}");
+    }
     if args.camera_height.is_some()
         && done.len() > 1
         && let Some(factor) = median(done.iter().map(|picture| picture.factor).collect())
@@ -252,7 +270,7 @@ pub fn run(args: Args) -> Result<()> {
     }
     let odometry = Odometry::new(&model, &params, &setup);
     for path in &paths {
-        if let Err(error) = path.write(&odometry, &scaling) {
+        if let Err(error) = path.write(&args, &odometry, &scaling) {
             note!("parallax: {error}");
             failed.push(Failure { input: path.file.to_string_lossy().into_owned(), error: error.to_string() });
         }
@@ -326,9 +344,10 @@ fn tell_skipped(skipped: &[PathBuf]) {
 fn predict(args: &Args, predictor: &Predictor, job: Job, scaling: &Scaling) -> Result<Done> {
     let started = Instant::now();
     let (height, width) = (predictor.setup().height, predictor.setup().width);
-    let picture = read_picture(&job.input.path)?;
+    let (picture, focal) = read_picture_with_lens(&job.input.path)?;
     let (w, h) = (picture.width() as usize, picture.height() as usize);
-    let camera = args.camera(w as f64, h as f64);
+    let lens = args.lens(&job.input.path, [w as f64, h as f64], focal)?;
+    let camera = lens.intrinsics;
     let seen = lanczos(&picture, width as u32, height as u32);
     let map = predictor.inverse_depth(&seen, args.flip);
     if !map.is_whole() {
@@ -340,7 +359,8 @@ fn predict(args: &Args, predictor: &Predictor, job: Job, scaling: &Scaling) -> R
     let input = job.input.path.to_string_lossy().into_owned();
     let doubt = doubt((w, h), (width, height));
     let seconds = started.elapsed().as_secs_f64();
-    Ok(Done { input, outputs: job.outputs, width: w, height: h, factor, median_depth, doubt, seconds })
+    let (view, view_by) = (lens.view(), lens.told);
+    Ok(Done { input, outputs: job.outputs, width: w, height: h, view, view_by, factor, median_depth, doubt, seconds })
 }
 
 /// A picture with fewer pixels on a side shows hardly anything.
@@ -350,7 +370,7 @@ const FEW: usize = 32;
 const STRETCHED: f64 = 5.0;
 
 /// Why little is to be expected of a picture of this width and height, seen at the size `seen`.
-fn doubt((w, h): (usize, usize), seen: (usize, usize)) -> Option<String> {
+pub(super) fn doubt((w, h): (usize, usize), seen: (usize, usize)) -> Option<String> {
     let stretched = (w as f64 / h as f64) / (seen.0 as f64 / seen.1 as f64);
     let to = format!("is stretched to the network's {}x{}", seen.0, seen.1);
     if w < FEW || h < FEW {

@@ -172,7 +172,25 @@ impl Camera {
     }
 }
 
+/// The camera that a `camera.toml` in a picture's folder, or the nearest one above it up to `root`, tells of pictures of
+/// `[width, height]` pixels; nothing if there is no such file, or it says where frames lie and nothing of the camera.
+///
+/// # Errors
+/// If the file cannot be read, or is for pictures of another aspect; the file is named.
+pub fn told_beside(picture: &Path, root: &Path, size: [f64; 2]) -> Result<Option<Intrinsics>> {
+    let Some((file, said)) = file_of(root, picture.parent().unwrap_or(root))? else { return Ok(None) };
+    match said.says_nothing() {
+        true => Ok(None),
+        false => said.intrinsics(size).map(Some).map_err(|why| Error::file(&file, why)),
+    }
+}
+
 impl CameraFile {
+    /// Whether it has no word on the camera.
+    fn says_nothing(&self) -> bool {
+        [self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.fov].iter().all(Option::is_none)
+    }
+
     /// Intrinsics of pictures of a size, `[width, height]`; why they cannot be, if they cannot.
     fn intrinsics(&self, size: [f64; 2]) -> Result<Intrinsics, String> {
         match *self {

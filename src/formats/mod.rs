@@ -8,6 +8,7 @@
 //! | [`pth`] | named tensors in PyTorch's pickles, read as data |
 //! | [`npz`], [`npy`] | NumPy's archives and arrays |
 //! | [`picture`] | reading pictures: PNG, JPEG, WebP |
+//! | [`exif`] | how a picture's camera was held, and its focal length |
 //! | [`png`] | writing them |
 //! | [`depth_png`] | depth as KITTI stores it |
 //! | [`pfm`] | reading disparity as Middlebury stores it |
@@ -19,6 +20,7 @@
 pub mod atomic;
 pub mod bounded;
 pub mod depth_png;
+pub mod exif;
 mod jpeg_scans;
 pub mod mat;
 pub mod npy;

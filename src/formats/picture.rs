@@ -12,6 +12,7 @@ use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageError, ImageReader, Limits, RgbImage};
 
 pub use super::bounded::MAX_PIXELS;
+use super::exif::Exif;
 use super::picture_structure as structure;
 use super::source::Source;
 use crate::{Error, Result};
@@ -143,13 +144,23 @@ fn undecodable(path: &Path, error: &Undecodable) -> Error {
 /// # Errors
 /// As [`check_picture`], if the file ends early, or if the pixels cannot be decoded.
 pub fn decode(path: &Path) -> Result<DynamicImage> {
+    decode_with_lens(path).map(|(picture, _)| picture)
+}
+
+/// [`decode`], and the focal length in pixels of the picture, where its EXIF data tell it.
+fn decode_with_lens(path: &Path) -> Result<(DynamicImage, Option<f64>)> {
     let mut bytes = Vec::new();
     open(path)?.take(MAX_BYTES).read_to_end(&mut bytes).map_err(|e| Error::io(path, e))?;
-    let size = dimensions(&mut Cursor::new(&bytes)).map_err(|e| undecodable(path, &e))?;
+    decode_bytes(path, &bytes)
+}
+
+/// Decodes the bytes of a picture's file; `path` is what messages call it.
+fn decode_bytes(path: &Path, bytes: &[u8]) -> Result<(DynamicImage, Option<f64>)> {
+    let size = dimensions(&mut Cursor::new(bytes)).map_err(|e| undecodable(path, &e))?;
     let (width, height) = check_size(path, size)?;
-    structure::check(&bytes).map_err(|fault| Error::file(path, fault))?;
+    structure::check(bytes).map_err(|fault| Error::file(path, fault))?;
     fenced(|| {
-        let mut source = Cursor::new(&bytes);
+        let mut source = Cursor::new(bytes);
         let mut reader = ImageReader::new(&mut source as &mut dyn Source).with_guessed_format()?;
         // Pixels have at most eight bytes; what lies beside them (colour profiles, texts) gets no more than that again.
         let mut limits = Limits::default();
@@ -158,10 +169,12 @@ pub fn decode(path: &Path) -> Result<DynamicImage> {
         let mut decoder = reader.into_decoder()?;
         // Metadata that cannot be read is no reason to refuse a picture.
         let exif = decoder.exif_metadata().ok().flatten();
-        let orientation = exif.and_then(|exif| structure::orientation(&exif)).and_then(Orientation::from_exif);
+        let exif = exif.map(|raw| Exif::parse(&raw)).unwrap_or_default();
+        let orientation = exif.orientation.and_then(Orientation::from_exif);
         let mut picture = DynamicImage::from_decoder(decoder)?;
+        let focal = exif.focal(f64::from(width), f64::from(height));
         picture.apply_orientation(orientation.unwrap_or(Orientation::NoTransforms));
-        Ok(picture)
+        Ok((picture, focal))
     })
     .map_err(|e| undecodable(path, &e))
 }
@@ -169,6 +182,19 @@ pub fn decode(path: &Path) -> Result<DynamicImage> {
 /// [`decode`] as 8-bit RGB: grey in all three channels, 16 bits rounded to 8, alpha left out, CMYK as its inks look.
 pub fn read_picture(path: &Path) -> Result<RgbImage> {
     decode(path).map(DynamicImage::into_rgb8)
+}
+
+/// [`read_picture`], and the focal length in pixels of the picture, where its [EXIF data](super::exif) tell it.
+pub fn read_picture_with_lens(path: &Path) -> Result<(RgbImage, Option<f64>)> {
+    decode_with_lens(path).map(|(picture, focal)| (picture.into_rgb8(), focal))
+}
+
+/// [`read_picture_with_lens`] of a file that is in memory; messages call it `name`.
+///
+/// # Errors
+/// As [`read_picture`].
+pub fn picture_of_bytes(name: &Path, bytes: &[u8]) -> Result<(RgbImage, Option<f64>)> {
+    decode_bytes(name, bytes).map(|(picture, focal)| (picture.into_rgb8(), focal))
 }
 
 #[cfg(test)]

@@ -109,75 +109,9 @@ fn check_webp(bytes: &[u8]) -> Result<(), Fault> {
     Ok(())
 }
 
-/// The orientation that EXIF data name, 1 to 8; their tag may be a short or a long number.
-pub(super) fn orientation(exif: &[u8]) -> Option<u8> {
-    let tiff = exif.strip_prefix(b"Exif\0\0").unwrap_or(exif);
-    let little = match tiff.get(..2)? {
-        b"II" => true,
-        b"MM" => false,
-        _ => return None,
-    };
-    let number = |at: usize, bytes: usize| -> Option<u32> {
-        let bytes = tiff.get(at..at.checked_add(bytes)?)?.iter();
-        let add = |sum: u32, &byte: &u8| sum << 8 | u32::from(byte);
-        Some(if little { bytes.rev().fold(0, add) } else { bytes.fold(0, add) })
-    };
-    let directory = number(4, 4)? as usize;
-    let entries = number(directory, 2)? as usize;
-    let entry = (0..entries).map(|i| directory + 2 + 12 * i).find(|&at| number(at, 2) == Some(0x0112))?;
-    let value = match number(entry + 2, 2)? {
-        3 => number(entry + 8, 2)?,
-        4 => number(entry + 8, 4)?,
-        _ => return None,
-    };
-    u8::try_from(value).ok().filter(|value| (1..=8).contains(value))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    /// EXIF data with one entry: the orientation.
-    fn exif(little: bool, kind: u16, value: u32) -> Vec<u8> {
-        let number = |value: u32, bytes: usize| {
-            let big = value.to_be_bytes()[4 - bytes..].to_vec();
-            if little { big.into_iter().rev().collect::<Vec<u8>>() } else { big }
-        };
-        let value = if kind == 3 { [number(value, 2), vec![0, 0]].concat() } else { number(value, 4) };
-        let order = if little { b"II" } else { b"MM" };
-        [
-            order.to_vec(),
-            number(42, 2),
-            number(8, 4),
-            number(1, 2),
-            number(0x0112, 2),
-            number(u32::from(kind), 2),
-            number(1, 4),
-            value,
-        ]
-        .concat()
-    }
-
-    #[test]
-    fn the_orientation_is_found_in_any_byte_order_and_as_short_or_long() {
-        for little in [true, false] {
-            for kind in [3, 4] {
-                for value in 1..=8 {
-                    assert_eq!(orientation(&exif(little, kind, value)), Some(value as u8), "{little} {kind}");
-                }
-                assert_eq!(orientation(&exif(little, kind, 9)), None);
-            }
-            assert_eq!(orientation(&exif(little, 2, 6)), None, "text");
-        }
-        let short = exif(true, 3, 6);
-        assert_eq!(orientation(&[b"Exif\0\0", &short[..]].concat()), Some(6));
-        for end in 0..short.len() - 2 {
-            assert_eq!(orientation(&short[..end]), None, "cut at {end}");
-        }
-        let mut far = short;
-        far[4..8].copy_from_slice(&u32::MAX.to_le_bytes());
-        assert_eq!(orientation(&far), None);
-    }
 
     #[test]
     fn a_picture_that_ends_early_is_seen_to() {

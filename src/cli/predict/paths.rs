@@ -4,9 +4,10 @@ use std::path::{Path, PathBuf};
 
 use parallax::eval::odometry::Odometry;
 use parallax::eval::trajectory::write_poses;
-use parallax::formats::picture::{check_picture, read_picture};
+use parallax::formats::picture::{read_picture, read_picture_with_lens};
 use parallax::{Error, Result};
 
+use super::Args;
 use super::outputs::Job;
 use super::scale::Scaling;
 
@@ -41,9 +42,10 @@ pub fn of(jobs: &[Job], out: &Path) -> Result<Vec<CameraPath>> {
 
 impl CameraPath {
     /// Finds the poses and writes them, lengths in the unit of depth.
-    pub fn write(&self, odometry: &Odometry, scaling: &Scaling) -> Result<()> {
-        let (width, height) = check_picture(&self.frames[0])?;
-        let scale = scaling.factor_of_all(scaling.camera(f64::from(width), f64::from(height)));
+    pub fn write(&self, args: &Args, odometry: &Odometry, scaling: &Scaling) -> Result<()> {
+        let (first, focal) = read_picture_with_lens(&self.frames[0])?;
+        let size = [f64::from(first.width()), f64::from(first.height())];
+        let scale = scaling.factor_of_all(args.lens(&self.frames[0], size, focal)?.intrinsics);
         let poses = odometry.path(self.frames.iter().map(|frame| read_picture(frame)), scale)?;
         write_poses(&self.file, &poses)?;
         note!("{} poses in {}", poses.len(), self.file.display());

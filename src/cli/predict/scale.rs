@@ -46,13 +46,13 @@ impl<'a> Scaling<'a> {
         match self.known() {
             Some(metres) => {
                 let whose = if self.args.fov.is_some() || self.args.intrinsics.is_some() {
-                    "the given"
+                    "the given view across"
                 } else {
-                    "an 81.5 degree"
+                    "each picture's view across"
                 };
                 note!(
-                    "pictures are seen at {width}x{height}; depth is in metres for a camera {} m above the road and {whose} view \
-                     across (--camera-height, --fov)",
+                    "pictures are seen at {width}x{height}; depth is in metres for a camera {} m above the road and {whose} \
+                     (--camera-height, --fov)",
                     metres.camera_height
                 );
             }
@@ -62,11 +62,6 @@ impl<'a> Scaling<'a> {
             ),
             None => note!("pictures are seen at {width}x{height}"),
         }
-    }
-
-    /// The camera of a picture of `width x height` pixels.
-    pub fn camera(&self, width: f64, height: f64) -> Intrinsics {
-        self.args.camera(width, height)
     }
 
     /// Factor on all depths of pictures of this camera, where pictures have no factor of their own.
@@ -93,18 +88,6 @@ impl<'a> Scaling<'a> {
     }
 }
 
-impl Args {
-    /// The camera of a picture of `width x height` pixels.
-    pub(super) fn camera(&self, width: f64, height: f64) -> Intrinsics {
-        let [fx, fy, cx, cy] = self.intrinsics.unwrap_or_else(|| {
-            // Half the width over the tangent of half the view.
-            let focal = self.fov.map_or(Intrinsics::KITTI.fx, |fov| 0.5 / (fov / 2.0).to_radians().tan()) * width;
-            [focal, focal, (width - 1.0) / 2.0, (height - 1.0) / 2.0]
-        });
-        Intrinsics { fx: fx / width, fy: fy / height, cx: cx / width, cy: cy / height }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -120,6 +103,10 @@ mod tests {
         <Command as clap::Parser>::try_parse_from(all).map(|command| command.args).unwrap()
     }
 
+    fn camera(args: &Args, width: f64, height: f64) -> Intrinsics {
+        args.lens("a.png".as_ref(), [width, height], None).unwrap().intrinsics
+    }
+
     #[test]
     fn every_flag_of_the_scale_gives_its_factor() {
         let input = Input { path: "a.png".into(), name: "a".into() };
@@ -129,7 +116,7 @@ mod tests {
             (0..24 * 80).map(|i| (((i / 80) as f64 - 11.5) / (80.0 * 0.58) / 0.5).max(0.01) as f32).collect();
         let factor = |more: &[&str]| {
             let args = args(more);
-            Scaling::new(&args, None).factor(&input, &road, size, args.camera(80.0, 24.0))
+            Scaling::new(&args, None).factor(&input, &road, size, camera(&args, 80.0, 24.0))
         };
         assert_eq!(factor(&[]).unwrap(), 1.0);
         assert_eq!(factor(&["--scale", "2.5"]).unwrap(), 2.5);
@@ -141,7 +128,7 @@ mod tests {
         assert!((longer / 6.6 - 1.0).abs() < 0.02, "{longer}");
         let nowhere = args(&["--camera-height", "1.65"]);
         let error = Scaling::new(&nowhere, None)
-            .factor(&input, &vec![0.1; 24 * 80], size, nowhere.camera(80.0, 24.0))
+            .factor(&input, &vec![0.1; 24 * 80], size, camera(&nowhere, 80.0, 24.0))
             .unwrap_err();
         assert!(error.to_string().contains("a.png: no road"), "{error}");
     }
@@ -156,7 +143,7 @@ mod tests {
         let factor = |more: &[&str], size: (f64, f64)| {
             let args = args(more);
             let scaling = Scaling::new(&args, Some(&origin));
-            (scaling.factor_of_all(args.camera(size.0, size.1)), scaling.unit())
+            (scaling.factor_of_all(camera(&args, size.0, size.1)), scaling.unit())
         };
         let near = |(found, unit): (f64, &str), expected: f64| {
             assert!((found / expected - 1.0).abs() < 5e-3 && unit == "metres", "{found} {unit}, expected {expected}");
@@ -179,9 +166,9 @@ mod tests {
             assert!(pairs.iter().all(|(a, b)| (a / b - 1.0).abs() < by), "{a:?} {b:?}");
         };
         // The published constants are those of KITTI's pictures, up to half a pixel.
-        close(args(&[]).camera(1242.0, 375.0), Intrinsics::KITTI, 4e-3);
-        close(args(&["--fov", "81.5"]).camera(640.0, 480.0), args(&[]).camera(640.0, 480.0), 1e-3);
-        let given = args(&["--intrinsics", "700,710,600,170"]).camera(1000.0, 500.0);
+        close(camera(&args(&[]), 1242.0, 375.0), Intrinsics::KITTI, 4e-3);
+        close(camera(&args(&["--fov", "81.5"]), 640.0, 480.0), camera(&args(&[]), 640.0, 480.0), 1e-3);
+        let given = camera(&args(&["--intrinsics", "700,710,600,170"]), 1000.0, 500.0);
         close(given, Intrinsics { fx: 0.7, fy: 1.42, cx: 0.6, cy: 0.34 }, 1e-12);
     }
 }
