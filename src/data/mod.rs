@@ -51,6 +51,16 @@ pub trait DataSource: Send + Sync {
         self.len() == 0
     }
 
+    /// The sample that stands at `index` (below [`len`](DataSource::len)) in an epoch, counted from 0. Data that go on
+    /// forever show others in every epoch, whose numbers need not be below `len`; all else are the same in all epochs.
+    fn of_epoch(&self, _epoch: u64, index: usize) -> usize {
+        index
+    }
+
+    /// Is told how many samples have been asked for so far, before those of the next step are: data that are made while
+    /// training goes on make what comes next.
+    fn about_to_read(&self, _position: u64) {}
+
     /// A name for messages: drive and frame.
     fn name(&self, sample: usize) -> String;
 

@@ -1,17 +1,15 @@
 //! The street as a dataset: sequences rendered once, kept as pictures; depth is cast again when it is asked for.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, OnceLock};
 
 use image::RgbImage;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::build::street;
-use super::camera::{Pose, View, drive, winding};
+use super::camera::{Pose, winding};
 use super::draw::Draw;
-use super::render::Scene;
-use super::wide::{camera, ride, wide_street};
+use super::sequence::{PATH, Sequence, usual_path};
 use super::world::World;
 use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
@@ -73,46 +71,17 @@ impl Default for StreetConfig {
     }
 }
 
-/// One street and the drive along it.
-struct Sequence {
-    world: World,
-    poses: Vec<Pose>,
-    intrinsics: Intrinsics,
-    images: Vec<Arc<RgbImage>>,
-    /// Depth of the frames, once it was asked for: rendering it takes as long as a picture.
-    depths: Vec<OnceLock<DepthMap>>,
-    /// Frames of the second camera; empty without one.
-    right: Vec<Arc<RgbImage>>,
-}
-
 /// Rendered streets, with exact depth and poses. A sample is a frame that has both neighbours.
 pub struct Street {
     config: StreetConfig,
     sequences: Vec<Sequence>,
 }
 
-/// What a stream of random numbers is for.
-const WORLD: u64 = 1;
-const PATH: u64 = 2;
-const CAMERA: u64 = 3;
-
 impl Street {
     /// Renders all sequences, on rayon's threads; the pictures are the same for any number of them. `progress` gets the
     /// number of frames done and of all, from any thread.
     pub fn render(config: &StreetConfig, progress: Option<&(dyn Fn(usize, usize) + Sync)>) -> Street {
-        let sequence = |k: usize, world: &World| {
-            if config.world == WorldKind::Street2 {
-                return ride(&mut Draw::new(config.seed, k as u64, PATH), config.frames, world.lane, world.bend);
-            }
-            drive(
-                &mut Draw::new(config.seed, k as u64, PATH),
-                config.frames,
-                world.lane,
-                world.room,
-                config.moving_cars,
-            )
-        };
-        Street::film(config, &sequence, progress)
+        Street::film(config, &|k, world| usual_path(config, k, world), progress)
     }
 
     /// Renders the streets of `config` along paths that wind, `rate` degrees a frame to one side, then to the other. All else
@@ -155,33 +124,13 @@ impl Street {
         let cameras = if config.baseline == 0.0 { 1 } else { 2 };
         let total = config.sequences * config.frames * cameras;
         let done = AtomicUsize::new(0);
-        let sequence = |k: usize| {
-            let draw = &mut Draw::new(config.seed, k as u64, WORLD);
-            let (world, intrinsics) = match config.world {
-                WorldKind::Street1 => (street(draw, config.frames, config.moving_cars), config.intrinsics),
-                WorldKind::Street2 => (
-                    wide_street(draw, config.frames, config.moving_cars),
-                    match config.own_lenses {
-                        true => camera(&mut Draw::new(config.seed, k as u64, CAMERA), config.intrinsics),
-                        false => config.intrinsics,
-                    },
-                ),
-            };
-            let poses = path(k, &world);
-            let image = |frame: usize, pose: Pose| {
-                let image = Scene::new(&world, View::new(config, intrinsics, pose), frame).image();
-                let done = done.fetch_add(1, Ordering::Relaxed) + 1;
-                if let Some(progress) = progress {
-                    progress(done, total);
-                }
-                Arc::new(image)
-            };
-            let images = poses.par_iter().enumerate().map(|(frame, pose)| image(frame, *pose)).collect();
-            let right = poses.par_iter().enumerate().map(|(frame, pose)| image(frame, pose.beside(config.baseline)));
-            let right = if config.baseline == 0.0 { Vec::new() } else { right.collect() };
-            let depths = poses.iter().map(|_| OnceLock::new()).collect();
-            Sequence { world, poses, intrinsics, images, depths, right }
+        let one_more = || {
+            let done = done.fetch_add(1, Ordering::Relaxed) + 1;
+            if let Some(progress) = progress {
+                progress(done, total);
+            }
         };
+        let sequence = |k: usize| Sequence::film(config, k, path, &one_more);
         Street { config: config.clone(), sequences: (0..config.sequences).into_par_iter().map(sequence).collect() }
     }
 
@@ -213,9 +162,7 @@ impl Street {
 
     /// The depth of a frame at the pixels' centres: camera z in metres, 0 for the sky. Panics if there is none such.
     pub fn frame_depth(&self, sequence: usize, frame: usize) -> DepthMap {
-        let Sequence { world, poses, intrinsics, depths, .. } = &self.sequences[sequence];
-        let render = || Scene::new(world, View::new(&self.config, *intrinsics, poses[frame]), frame).depth();
-        depths[frame].get_or_init(render).clone()
+        self.sequences[sequence].depth(&self.config, frame)
     }
 
     /// How many samples there are: frames that have both neighbours.

@@ -41,8 +41,8 @@ fn sample(image: &RgbImage, u: f64, v: f64) -> Option<[f64; 3]> {
 
 /// Mean absolute differences, of the neighbour as it is and warped, over pixels of known depth that the source sees too.
 fn errors(street: &Street, sample_index: usize, offset: i32) -> (f64, f64, usize) {
-    let config = street.config();
     let (sequence, frame) = street.locate(sample_index);
+    let config = &StreetConfig { intrinsics: street.camera(sequence), ..street.config().clone() };
     let target = street.image(sample_index, 0).unwrap();
     let source = street.image(sample_index, offset).unwrap();
     let depth = street.depth(sample_index).unwrap().unwrap();
@@ -90,6 +90,34 @@ fn depth_pose_and_intrinsics_warp_neighbours_onto_the_target() {
     println!("as it is {still:.2}, warped {warped:.2} of 255; {share:.2} of the pixels");
     assert!(share > 0.5, "{share}");
     assert!(warped < 0.35 * still, "{warped} against {still}");
+}
+
+/// Every lens, height, pitch and roll: what a network is told of them has to be true.
+#[test]
+fn wide_streets_of_many_cameras_warp_onto_their_targets_too() {
+    let config = StreetConfig {
+        world: WorldKind::Street2,
+        own_lenses: true,
+        sequences: 24,
+        frames: 3,
+        ..StreetConfig::default()
+    };
+    let street = Street::render(&config, None);
+    let (mut still, mut warped, mut better) = (0.0, 0.0, 0);
+    for sample in 0..street.len() {
+        let (a, b, n) = errors(&street, sample, 1);
+        assert!(n > 0, "sample {sample} sees nothing again");
+        (still, warped, better) = (still + a, warped + b, better + usize::from(b < a));
+    }
+    println!("as it is {still:.1}, warped {warped:.1}; {better} of {} are better", street.len());
+    assert!(better == street.len() && warped < 0.5 * still, "{warped} against {still}, {better}");
+}
+
+/// Figures of runs are compared over the years: the embedded street keeps its pixels.
+#[test]
+fn the_embedded_street_is_what_it_was() {
+    let street = Street::render(&StreetConfig { height: 96, width: 320, sequences: 3, frames: 4, ..small() }, None);
+    assert_eq!(crc32fast::hash(&bytes(&street)), 1_117_542_805, "the embedded street looks otherwise than it did");
 }
 
 #[test]

@@ -9,7 +9,7 @@ use crate::data::apart::refuse_shared;
 use crate::data::aside::set_aside;
 use crate::data::{DataSource, Opening, Subset, open_folder};
 use crate::error::{Error, Result};
-use crate::street::{Street, StreetConfig, WorldKind};
+use crate::street::{Endless, SHOWN, Street, StreetConfig, WorldKind};
 
 /// The name of the embedded street as a data set. A folder of that name is `./street`.
 pub const STREET: &str = "street";
@@ -71,11 +71,14 @@ fn knows_depth(data: &dyn DataSource) -> Result<bool> {
 /// The bytes of pictures that are held in memory while a run goes on: all of the street's, none of a folder's.
 pub(super) fn bytes_held(config: &RunConfig) -> f64 {
     let cameras = if config.sources.other_camera() { 2 } else { 1 };
-    let frames = match config.data.as_str() {
-        STREET | STREET_1 => cameras * SEQUENCES.iter().sum::<usize>() * FRAMES,
-        STREET_2 => cameras * WIDE_SEQUENCES.iter().sum::<usize>() * WIDE_FRAMES,
-        _ => 0,
+    let ([train, validation, test], frames) = match config.data.as_str() {
+        STREET | STREET_1 => (SEQUENCES, FRAMES),
+        STREET_2 => (WIDE_SEQUENCES, WIDE_FRAMES),
+        _ => return 0.0,
     };
+    // The epoch before, this one, and what is rendered for the next.
+    let train = if config.endless { train + 2 * train / SHOWN } else { train };
+    let frames = cameras * (train + validation + test) * frames;
     // Three bytes of a pixel, and where depth is learnt from, four more.
     let each = if config.loss.depth_supervision > 0.0 { 7.0 } else { 3.0 };
     each * (frames * config.height * config.width) as f64
@@ -84,11 +87,11 @@ pub(super) fn bytes_held(config: &RunConfig) -> f64 {
 fn street(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + Sync)) -> RunData {
     let RunConfig { height, width, seed, .. } = *config;
     let wide = config.data == STREET_2;
-    let street = |what: &'static str, sequences: usize, seed: u64| {
+    let settings = |sequences: usize, seed: u64| {
         let baseline = if config.sources.other_camera() { BASELINE } else { 0.0 };
         let usual =
             StreetConfig { height, width, sequences, frames: FRAMES, seed, baseline, ..StreetConfig::default() };
-        let settings = match wide {
+        match wide {
             true => StreetConfig {
                 frames: WIDE_FRAMES,
                 world: WorldKind::Street2,
@@ -97,12 +100,21 @@ fn street(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + S
                 ..usual
             },
             false => usual,
-        };
-        Arc::new(Street::render(&settings, Some(&|done, all| progress(what, done, all))))
+        }
+    };
+    let street = |what: &'static str, sequences: usize, seed: u64| {
+        Arc::new(Street::render(&settings(sequences, seed), Some(&|done, all| progress(what, done, all))))
     };
     let [train, validation, test] = if wide { WIDE_SEQUENCES } else { SEQUENCES };
+    let train: Arc<dyn DataSource> = match config.endless {
+        true => {
+            let told = |done, all| progress("street", done, all);
+            Arc::new(Endless::render(&settings(train, seed), Some(&told)))
+        }
+        false => street("street", train, seed),
+    };
     RunData {
-        train: street("street", train, seed),
+        train,
         validation: street("validation", validation, seed.wrapping_add(APART)),
         test: Some(street("test", test, seed.wrapping_add(2 * APART))),
     }

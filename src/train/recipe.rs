@@ -174,6 +174,10 @@ pub struct RunConfig {
     /// the folder, if there is any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prepared: Option<PathBuf>,
+    /// Whether rendered training data go on forever: sequences that were never seen are rendered while training goes on, and
+    /// take the place of the oldest ([`Endless`](crate::street::Endless)).
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub endless: bool,
     /// Weights to start from: files or folders, all four networks together; `shipped` means those inside the program.
     #[serde(default, deserialize_with = "none_one_or_many", skip_serializing_if = "Vec::is_empty")]
     pub init: Vec<PathBuf>,
@@ -261,6 +265,7 @@ impl RunConfig {
             pairs_first: pairs_first(),
             skip_bad_frames: false,
             prepared: None,
+            endless: false,
             init: Vec::new(),
             init_encoder: None,
             init_pose: None,
@@ -402,6 +407,16 @@ impl RunConfig {
         }
         if self.initial_disparity.is_some_and(|d| d.is_nan() || d <= 0.0 || d >= 1.0) {
             return Err(Error::setting("initial_disparity", "expected a number between 0 and 1"));
+        }
+        if self.endless && !super::data::is_rendered(&self.data) {
+            let message = format!("{} has an end: only the data that this program renders go on forever", self.data);
+            return Err(Error::setting("endless", message));
+        }
+        if self.endless && self.sources.other_camera() {
+            return Err(Error::setting(
+                "endless",
+                "there is no second camera: leave it out, or use sources = \"mono\"",
+            ));
         }
         check_share("pose_first", self.pose_first)?;
         check_share("auto_mask_delay", self.auto_mask_delay)?;
