@@ -5,6 +5,7 @@ use parallax::monovit::Preset;
 use parallax::nn::Context;
 use parallax::tensor::{Tensor, Var, pool, profile};
 use parallax::train::cost::{Cost, check_memory};
+use parallax::train::fit::fit_memory;
 use parallax::train::{RunConfig, Trainer};
 
 fn triplets(height: usize, width: usize, batch: usize) -> Batch {
@@ -41,10 +42,35 @@ fn small_steps_tell_what_larger_ones_cost() {
         assert!((0.9..1.1).contains(&ratio), "{h}x{w}, batch {batch}: {ratio}");
         assert!(cost.seconds_step > 0.0 && cost.seconds_inference < cost.seconds_step);
     }
+    assert_fits();
     if std::path::Path::new("/proc/meminfo").exists() {
         assert!(check_memory(&RunConfig { preset: Preset::Pico, ..RunConfig::usual() }).is_ok());
         let huge = RunConfig { preset: Preset::Pico, height: 8192, width: 8192, batch: 1000, ..RunConfig::usual() };
         let error = check_memory(&huge).expect_err("too much").to_string();
         assert!(error.contains("pico at 8192x8192, batch 1000") && error.contains("GiB are free"), "{error}");
     }
+}
+
+/// Less and less memory: first layers are computed again, then the batch is cut, and in the end it is an error.
+fn assert_fits() {
+    // A folder's pictures are not held: a step is all there is.
+    let usual = RunConfig { preset: Preset::Pico, data: "frames".into(), batch: 6, ..RunConfig::usual() };
+    let of = |batch: usize, recompute: bool| {
+        Cost::of(&Preset::Pico.config(), [96, 320], batch, recompute).expect("counted").bytes_step
+    };
+    let fit = |most: f64| {
+        let mut config = usual.clone();
+        fit_memory(&mut config, most).map(|fitted| (config, fitted))
+    };
+    let (whole, again) = (of(6, false), of(6, true));
+    assert!(again < whole, "{again} {whole}");
+    let (config, fitted) = fit(1.01 * whole).expect("as it is");
+    assert_eq!((config, fitted.changes.len()), (usual.clone(), 0));
+    let (config, fitted) = fit(0.5 * (whole + again)).expect("computed again");
+    assert!(config == RunConfig { recompute: true, ..usual.clone() } && fitted.changes.len() == 1, "{fitted:?}");
+    let (config, fitted) = fit(0.99 * again).expect("in parts");
+    assert!(config.batch * config.accumulate == 6 && config.batch < 6, "{config:?}");
+    assert!(fitted.bytes <= 0.99 * again && fitted.changes[0].contains("parts of"), "{fitted:?}");
+    let error = fit(0.5 * of(1, true)).expect_err("too little").to_string();
+    assert!(error.contains("pico at 320x96") && error.contains("MiB are allowed"), "{error}");
 }

@@ -9,6 +9,7 @@ use parallax::data::apart::neighbours;
 use parallax::monovit::{Preset, Setup};
 use parallax::train::cost::check_memory;
 use parallax::train::data::{self, is_rendered};
+use parallax::train::fit::{Fitted, fit_memory};
 use parallax::train::freeze::frozen;
 use parallax::train::layers::Layers;
 use parallax::train::recipe::{RunConfig, STEPS};
@@ -39,6 +40,10 @@ pub struct Args {
     /// folder beside it, which is what the run then trains on.
     #[arg(long, value_name = "street|street-2|DIR|FILM")]
     data: Option<String>,
+    /// Render new sequences while training goes on, for `street` and `street-2`: every epoch shows half of the last one's and
+    /// as many that were never seen.
+    #[arg(long)]
+    endless: bool,
     #[command(flatten)]
     film: FilmArgs,
     /// List of a folder's frames to train on, lines `FOLDER FRAME`, or of KITTI and Cityscapes `FOLDER FRAME SIDE`
@@ -74,6 +79,12 @@ pub struct Args {
     /// Compute transformer layers again in the backward pass: a step takes less memory and more time.
     #[arg(long)]
     recompute: bool,
+    /// Memory that training may take, such as 8G or 900M (1G is 1024M, 1M is 1024 x 1024 bytes): what it takes to fit is done
+    /// and said. First transformer layers are computed again (--recompute), then the batch is taken in parts, whose
+    /// gradients are averaged (--accumulate). An estimate, good to a tenth [default: the configuration as it is, refused if
+    /// the free memory is not enough].
+    #[arg(long, value_name = "SIZE", value_parser = bytes_of)]
+    memory: Option<f64>,
     /// Steps between two lines of the log [default: 10].
     #[arg(long, value_name = "N")]
     log_every: Option<u64>,
@@ -276,7 +287,15 @@ fn show(event: &Event, progress: &mut Progress, stop: &Stop) {
 fn create(args: &Args) -> Result<(Run, RunData)> {
     let mut config = configuration(args)?;
     config.check()?;
-    check_memory(&config)?;
+    match args.memory {
+        Some(most) => {
+            let Fitted { bytes, changes } = fit_memory(&mut config, most)?;
+            let fits = if changes.is_empty() { "fits as it is" } else { "fits with changes" };
+            note!("{:.2} GiB of memory: the training {fits}, and needs about {:.2} GiB", gib(most), gib(bytes));
+            changes.iter().for_each(|change| note!("  {change}"));
+        }
+        None => check_memory(&config)?,
+    }
     // Weights that do not fit are found out before anything is rendered or made.
     let start = Start::of(&config)?;
     for (files, report) in &start.reports {
@@ -374,6 +393,8 @@ impl Args {
             ("--learning-rate", self.learning_rate.is_some()),
             ("--seed", self.seed.is_some()),
             ("--val-split", self.val_split.is_some()),
+            ("--endless", self.endless),
+            ("--memory", self.memory.is_some()),
             ("--prepared", self.prepared.is_some()),
             ("--fov", self.lens.fov.is_some()),
             ("--intrinsics", self.lens.intrinsics.is_some()),
@@ -394,6 +415,22 @@ impl Args {
             None => Ok(()),
         }
     }
+}
+
+fn gib(bytes: f64) -> f64 {
+    bytes / f64::from(1 << 30)
+}
+
+/// Bytes from a number with a unit: `8G`, `1.5GiB`, `900M`.
+fn bytes_of(text: &str) -> Result<f64, String> {
+    let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
+    let unit = match text[digits.len()..].to_ascii_lowercase().as_str() {
+        "g" | "gb" | "gib" => f64::from(1 << 30),
+        "m" | "mb" | "mib" => f64::from(1 << 20),
+        _ => return Err("expected a number with a unit: 8G, 900M".into()),
+    };
+    let number = digits.trim().parse::<f64>().ok().filter(|x| *x > 0.0 && x.is_finite());
+    number.map(|x| x * unit).ok_or_else(|| "expected a number above 0 with a unit: 8G, 900M".into())
 }
 
 /// A path that means the same from any folder.
@@ -449,6 +486,7 @@ fn configuration(args: &Args) -> Result<RunConfig> {
     c.allow_partial |= args.allow_partial;
     c.skip_bad_frames |= args.skip_bad_frames;
     c.recompute |= args.recompute;
+    c.endless |= args.endless;
     c.camera = args.lens.or(c.camera);
     args.stereo.apply(&mut c);
     args.networks.apply(&mut c.ablation);

@@ -27,6 +27,8 @@ pub struct Cost {
     pub flops_step: f64,
     /// Memory of a training step, in bytes: parameters, gradients, moments, average, and what the backward pass needs.
     pub bytes_step: f64,
+    /// Memory of the parameters alone, in bytes: gradients take as much again.
+    pub bytes_parameters: f64,
     /// Time of the prediction of a batch on this machine, in seconds: the arithmetic, at the speed of a small prediction.
     pub seconds_inference: f64,
     /// Time of a training step on this machine, in seconds: the arithmetic, at the speed of a small step.
@@ -79,6 +81,7 @@ impl Cost {
             flops_inference: at[0],
             flops_step: at[1],
             bytes_step: OVERHEAD * (at[2] + state),
+            bytes_parameters: parameters,
             seconds_inference: at[0] / speed[0],
             seconds_step: at[1] / speed[1],
         })

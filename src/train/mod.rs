@@ -2,6 +2,7 @@
 
 pub mod cost;
 pub mod data;
+pub mod fit;
 pub mod freeze;
 pub mod health;
 pub mod layers;
