@@ -21,6 +21,7 @@ mod eval;
 mod film;
 mod gradcheck;
 mod info;
+mod lens;
 mod predict;
 mod progress;
 mod report;
@@ -28,6 +29,7 @@ mod sheet;
 mod sizes;
 mod stereo;
 mod train;
+mod view;
 mod weights;
 
 use std::process::ExitCode;
@@ -54,6 +56,8 @@ enum Command {
     Eval(eval::Args),
     /// Predict depth maps of pictures.
     Predict(predict::Args),
+    /// Look at depth in the browser: drop pictures in, point, turn the points, click for attention, play a folder.
+    View(view::Args),
     /// Make the page of a run, or one that compares several: curves, warnings, pictures, configuration.
     Report(report::Args),
     /// Convert weights between file formats: PyTorch's .pth, safetensors, NumPy's .npz.
@@ -80,6 +84,7 @@ pub fn main() -> ExitCode {
         Command::Train(args) => train::run(*args),
         Command::Eval(args) => eval::run(args),
         Command::Predict(args) => predict::run(args),
+        Command::View(args) => view::run(args),
         Command::Report(args) => report::run(args),
         Command::Convert(args) => convert::run(args),
         Command::Attention(args) => attention::run(args),

@@ -31,6 +31,11 @@ impl WeightsArgs {
         names.join(", ")
     }
 
+    /// These flags, for other weights.
+    pub fn instead(&self, path: &Path) -> WeightsArgs {
+        WeightsArgs { weights: vec![path.to_owned()], ..self.clone() }
+    }
+
     /// Whether the network is to see pictures of another size than its weights were trained for.
     pub fn resized(&self) -> bool {
         self.height.is_some() || self.width.is_some()
