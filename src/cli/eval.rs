@@ -14,7 +14,7 @@ use parallax::eval::protocol::Protocol;
 use parallax::eval::scale::Scale;
 use parallax::eval::study::{Settings, study};
 use parallax::formats::atomic::write_bytes_atomically;
-use parallax::train::data::STREET;
+use parallax::train::data::is_rendered;
 use parallax::weights::Weights;
 use parallax::{Error, Result};
 
@@ -67,10 +67,10 @@ pub struct Args {
     /// The predicted poses to compare with --poses, in the same form, one for each frame.
     #[arg(long, value_name = "FILE", requires = "poses")]
     trajectory: Option<PathBuf>,
-    /// Frames to measure on: `street` (with a seed that no run trains on) or a folder: in
+    /// Frames to measure on: `street` or `street-2` (with a seed that no run trains on) or a folder: in
     /// the layout of KITTI raw, or (where the protocol is not KITTI's) of frames with depth maps, as train takes them, or
     /// in the layout of Cityscapes' video, KITTI 2015, Make3D, DrivingStereo's weather sets or Middlebury 2014.
-    #[arg(long, value_name = "street|DIR", default_value = "street")]
+    #[arg(long, value_name = "street|street-2|DIR", default_value = "street")]
     data: String,
     /// List of a folder's frames, lines `FOLDER FRAME SIDE` [default: all].
     #[arg(long, value_name = "FILE")]
@@ -165,7 +165,7 @@ pub fn run(args: Args) -> Result<()> {
         let candidate = args.candidate(&weights)?;
         let (height, width) = (candidate.height, candidate.width);
         if let Some(first) = found.first().filter(|first| (first.height, first.width) != (height, width))
-            && args.data == STREET
+            && is_rendered(&args.data)
         {
             let message = format!(
                 "{} sees pictures of {height}x{width}, {} of {}x{}: give --height and --width, so that both see one street",
@@ -215,7 +215,7 @@ impl Args {
             return Ok(Candidate { name: path.display().to_string(), by: By::File(found), height, width });
         }
         if let Some(folder) = &self.predictions {
-            if self.data == STREET {
+            if is_rendered(&self.data) {
                 let message = "the street's frames have no files to match: write it with `data street --out DIR`, and give \
                                --data DIR";
                 return Err(Error::setting("predictions", message));

@@ -4,13 +4,14 @@ use std::path::{Path, PathBuf};
 
 use parallax::eval::predictor::Predictor;
 use parallax::eval::shipping::{calibrate, moved, on_streets, streets};
+use parallax::formats::bounded::{MAX_SETTINGS, read_text};
 use parallax::tensor::simd;
 use parallax::train::RunConfig;
 use parallax::train::data::{STREET, STREET_2, is_rendered};
 use parallax::train::layers::read_config;
 use parallax::weights::{Need, Origin, SHIPPED, Sources, load_from, ship};
 use parallax::{Error, Result};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::Args;
 
@@ -46,6 +47,7 @@ pub fn run(args: &Args) -> Result<()> {
         return Err(Error::file(&args.out, "is there already: --force replaces it (OUT is the last argument)"));
     }
     let config = read_config(&folder.join("config.toml"))?;
+    let trained_by = TrainedBy::of(folder)?;
     let sources = Sources::open(std::slice::from_ref(folder))?;
     let weights = load_from(&sources, Need::All, false)?;
     let mut rounded = load_from(&sources, Need::All, false)?;
@@ -64,8 +66,8 @@ pub fn run(args: &Args) -> Result<()> {
         world: args.world.clone().unwrap_or_else(|| world(&config)),
         steps: steps(folder).unwrap_or(config.steps),
         recipe: recipe(&config)?,
-        version: env!("CARGO_PKG_VERSION").into(),
-        simd: simd::level()?.into(),
+        version: trained_by.version,
+        simd: trained_by.simd,
         licence: env!("CARGO_PKG_LICENSE").into(),
         metres: calibration.metres,
     };
@@ -88,6 +90,29 @@ pub fn run(args: &Args) -> Result<()> {
     }
     shipped.print();
     Ok(())
+}
+
+/// The program that trained a run: another version, or another SIMD level, would have made other weights.
+#[derive(Deserialize)]
+struct TrainedBy {
+    version: String,
+    simd: String,
+}
+
+impl TrainedBy {
+    /// What the run's `machine.json` says; of a run that has none, this program is taken for it, and that is said.
+    ///
+    /// # Errors
+    /// If the file is damaged.
+    fn of(folder: &Path) -> Result<Self> {
+        let path = folder.join("machine.json");
+        if !path.exists() {
+            note!("{} is missing: this program is named as the one that trained the weights", path.display());
+            return Ok(TrainedBy { version: env!("CARGO_PKG_VERSION").into(), simd: simd::level()?.into() });
+        }
+        let text = read_text(&path, MAX_SETTINGS, "what a run was trained on")?;
+        serde_json::from_str(&text).map_err(|e| Error::file(&path, format!("expected version and simd: {e}")))
+    }
 }
 
 impl Shipped<'_> {
@@ -169,6 +194,20 @@ fn last_part(path: &Path) -> PathBuf {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn weights_are_of_the_program_that_trained_them() {
+        let folder = tempfile::tempdir().unwrap();
+        let here = TrainedBy::of(folder.path()).unwrap();
+        assert_eq!((&here.version[..], &here.simd[..]), (env!("CARGO_PKG_VERSION"), simd::level().unwrap()));
+        let file = folder.path().join("machine.json");
+        std::fs::write(&file, r#"{"version": "0.0.7", "simd": "neon", "threads": 3}"#).unwrap();
+        let there = TrainedBy::of(folder.path()).unwrap();
+        assert_eq!((&there.version[..], &there.simd[..]), ("0.0.7", "neon"));
+        std::fs::write(&file, r#"{"version": "0.0.7"}"#).unwrap();
+        let error = TrainedBy::of(folder.path()).err().unwrap().to_string();
+        assert!(error.contains("machine.json") && error.contains("simd"), "{error}");
+    }
 
     #[test]
     fn a_recipe_names_no_folder_of_this_machine() {

@@ -9,7 +9,7 @@ use parallax::eval::protocol::{Logarithm, Protocol};
 use parallax::eval::scale::Scale;
 use parallax::eval::study::{Difference, Interval, Study};
 use parallax::report::plot::{Line, Plot};
-use parallax::train::data::STREET;
+use parallax::train::data::is_rendered;
 use serde::Serialize;
 
 use super::Args;
@@ -119,7 +119,7 @@ impl Measured {
             disparities: args.disparities.clone(),
             predictions: args.predictions.clone(),
             data: match args.data.as_str() {
-                STREET => format!("street of seed {}", args.seed),
+                rendered if is_rendered(rendered) => format!("{rendered} of seed {}", args.seed),
                 folder => folder.to_owned(),
             },
             split: args.split.clone(),

@@ -11,14 +11,27 @@ use parallax::data::stills::{Layout, Stills};
 use parallax::eval::projected::Projected;
 use parallax::eval::protocol::Protocol;
 use parallax::eval::scale::Scale;
-use parallax::street::{Street, StreetConfig};
+use parallax::street::{Street, StreetConfig, WorldKind};
+use parallax::train::data::{STREET_2, is_rendered};
 
 use super::Args;
 
 /// The data to measure on, at the networks' size, and the frames that cannot be measured.
 pub fn open(args: &Args, height: usize, width: usize) -> Result<(Box<dyn DataSource>, LeftOut)> {
-    if args.data == "street" {
+    if is_rendered(&args.data) {
         let street = StreetConfig { height, width, sequences: 8, seed: args.seed, ..StreetConfig::default() };
+        let street = match args.data == STREET_2 {
+            // Many short drives: each has a road and a camera of its own.
+            true => StreetConfig {
+                sequences: 88,
+                frames: 4,
+                world: WorldKind::Street2,
+                own_lenses: true,
+                moving_cars: true,
+                ..street
+            },
+            false => street,
+        };
         return Ok((Box::new(Street::render(&street, None)), LeftOut::default()));
     }
     let root = Path::new(&args.data);
