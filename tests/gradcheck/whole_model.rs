@@ -1,6 +1,6 @@
 //! The whole of a small MonoViT and its loss, in f64: by the slope of the Taylor remainder along random directions.
 
-use parallax::data::batch::{Augment, Batch, batch_of_step};
+use parallax::data::batch::{Augment, Batch, Making, batch_of_step};
 use parallax::monovit::loss::{LossConfig, Views, loss};
 use parallax::monovit::{Config, MonoVit, Preset};
 use parallax::nn::{Context, Params};
@@ -24,7 +24,7 @@ fn total(
         sources: batch.sources.iter().map(constant).collect(),
         smaller_sources: batch.smaller_sources().iter().map(|scale| scale.iter().map(constant).collect()).collect(),
         intrinsics: batch.intrinsics.clone(),
-        depth: None,
+        depth: batch.depth.as_ref().map(|depth| depth.cast::<f64>()),
     };
     let disparities = model.disparities(&c, &target);
     let transforms = model.transforms(&c, &prev, &target, &next);
@@ -57,12 +57,19 @@ fn the_taylor_remainder_of_the_whole_loss_falls_with_the_square_of_the_step() {
     assert_taylor(Preset::Pico.config(), &LossConfig::default(), &prefixes);
 }
 
+#[test]
+fn supervision_by_known_depth_has_the_gradient_of_its_value() {
+    let loss = LossConfig { depth_supervision: 1.0, ..LossConfig::default() };
+    assert_taylor(Preset::Pico.config(), &loss, &["encoder.", "depth.", ""]);
+}
+
 /// The slope along random directions of the parameters under each prefix: near 2, and near 1 with a wrong gradient.
 pub fn assert_taylor(sizes: Config, loss: &LossConfig, prefixes: &[&str]) {
     let config = StreetConfig { height: 64, width: 96, sequences: 1, frames: 5, ..StreetConfig::default() };
     let street = Street::render(&config, None);
-    let batch =
-        batch_of_step(&street, Augment { flip: false, jitter: false, sensor: false }, 1, 0, 0).expect("a batch");
+    let plain = Augment { flip: false, jitter: false, sensor: false };
+    let making = Making { depth: loss.depth_supervision > 0.0, ..Making::from(plain) };
+    let batch = batch_of_step(&street, making, 1, 0, 0).expect("a batch");
     let (model, params) = MonoVit::new::<f64>(sizes, 3);
     let tape = Tape::new();
     let (c, found) = total(&model, &params, &tape, &batch, loss);
