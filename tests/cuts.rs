@@ -58,5 +58,9 @@ fn unchecked_in_training(checked: &Regimes, architecture: Architecture) -> Vec<S
     assert!(cut.len() > 80, "only {} cuts were recorded", cut.len());
     let known = |key| checked.rows.get(key).is_some_and(|row| row.most > 1);
     let unknown = cut.iter().filter(|key| !known(key));
-    unknown.map(|(op, algo, place)| format!("{op} [{algo}] is cut at {place} in training {}, in no case", architecture.name())).collect()
+    unknown
+        .map(|(op, algo, place)| {
+            format!("{op} [{algo}] is cut at {place} in training {}, in no case", architecture.name())
+        })
+        .collect()
 }

@@ -20,7 +20,6 @@ macro_rules! encoders {
         /// An encoder by its name.
         #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
         #[cfg_attr(feature = "cli", derive(clap::ValueEnum))]
-        #[allow(missing_docs)]
         pub enum EncoderKind {
             #[default]
             $($(#[$doc])+ #[serde(rename = $name)] #[cfg_attr(feature = "cli", value(name = $name))] $kind,)+

@@ -19,7 +19,12 @@ fn street(height: usize, width: usize) -> Street {
 }
 
 /// The kernel paths of training (and of what comes before it), of a prediction and of an evaluation of one architecture.
-fn paths(architecture: Architecture, height: usize, width: usize, batch: usize) -> BTreeSet<(&'static str, &'static str)> {
+fn paths(
+    architecture: Architecture,
+    height: usize,
+    width: usize,
+    batch: usize,
+) -> BTreeSet<(&'static str, &'static str)> {
     let street = street(height, width);
     let mut config = RunConfig::new(architecture, 10);
     config.auto_mask_delay = 0.0;
@@ -64,7 +69,12 @@ fn every_kernel_path_that_training_prediction_and_evaluation_take_is_checked() {
 }
 
 /// Trains on one thread and on two, and compares every weight.
-fn assert_same_bits_on_one_and_two_threads(architecture: impl Into<Architecture>, height: usize, width: usize, steps: u64) {
+fn assert_same_bits_on_one_and_two_threads(
+    architecture: impl Into<Architecture>,
+    height: usize,
+    width: usize,
+    steps: u64,
+) {
     let (street, architecture) = (street(height, width), architecture.into());
     let train = |threads: usize| -> Params<f32> {
         parallel::with_threads(threads, || {
