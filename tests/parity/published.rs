@@ -47,12 +47,12 @@ pub fn input(name: &str) -> Var<f64> {
     image.map(|x| 0.5 * x + 0.5).permute(&[0, 2, 3, 1]).into()
 }
 
-/// Weights made from the names; a shared tensor takes the value of its last one.
-pub fn fill_from_names(params: &mut Params<f64>) {
+/// Weights made from the names, as far as `part` takes them; a shared tensor takes the value of its last one.
+pub fn fill_from_names(params: &mut Params<f64>, part: fn(&str) -> &str) {
     let ids: Vec<_> = params.iter().map(|(id, _)| id).collect();
     for id in ids {
         let p = params.get(id);
-        let theirs = from_name(p.names.last().expect("a name"), p.layout.export(&p.value).shape());
+        let theirs = from_name(part(p.names.last().expect("a name")), p.layout.export(&p.value).shape());
         let ours = p.layout.import(&theirs).expect("a layout that fits");
         params.set(id, ours);
     }
@@ -81,7 +81,7 @@ fn check(preset: Preset) {
         assert_eq!(params.count(&format!("{part}.")) as u64, count.as_u64().expect("a count"), "{size}: {part}");
     }
 
-    fill_from_names(&mut params);
+    fill_from_names(&mut params, |name| name);
     let reference = safetensors::read::<f64>(&fixture_path("published.safetensors")).expect("the fixture").tensors;
     let c = Context::inference(&params);
     let features = model.features(&c, &input("input"));
