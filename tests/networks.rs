@@ -289,8 +289,8 @@ fn every_command_works_with_another_network() {
     for (arguments, words) in [
         (&["info", "--encoder", "resnet50", "--preset", "tiny"][..], &["no tiny of resnet50", "pico, nano, small"][..]),
         (&["info", "--encoder", "mpvit-tiny", "--preset", "small"], &["--encoder", "--preset is small"]),
-        (&["info", "--network", "monodepth2", "--no-decoder-attention"], &["decoder_attention", "network monovit"]),
-        (&["info", "--encoder", "resnet18", "--transformer-paths", "1"], &["transformer_paths", "encoder mpvit"]),
+        (&["info", "--network", "monodepth2", "--no-decoder-attention"], &["no such part", "network monovit"]),
+        (&["info", "--encoder", "resnet18", "--transformer-paths", "1"], &["--transformer-paths", "encoder mpvit"]),
         (&["info", "--encoder", "vgg16"], &["resnet18", "mpvit-tiny"]),
         (
             &["train", "--init", &run, "--network", "monovit", "--encoder", "mpvit"],
