@@ -55,10 +55,14 @@ fn every_kernel_path_that_training_prediction_and_evaluation_take_is_checked() {
     for architecture in Architecture::all() {
         // The reduced networks as they are trained; the published ones small, since their widths decide the paths.
         let (height, width, batch) = if architecture.preset == Preset::Nano { (96, 320, 2) } else { (64, 96, 1) };
-        // MPViT takes its paths under either decoder.
-        if (architecture.network, architecture.encoder) == (Network::Monodepth2, EncoderKind::Mpvit)
-            && architecture.preset != Preset::Nano
-        {
+        // An encoder takes its paths under either decoder, and ResNet-18 those of ResNet-34.
+        let again = match (architecture.network, architecture.encoder) {
+            (Network::Monodepth2, EncoderKind::Mpvit) => architecture.preset != Preset::Nano,
+            (network, EncoderKind::Resnet18) => network == Network::Monovit,
+            (network, EncoderKind::Resnet34) => network == Network::Monodepth2,
+            _ => false,
+        };
+        if again {
             continue;
         }
         let ran = paths(architecture, height, width, batch);
