@@ -6,6 +6,7 @@
 //! | build and train a network | [`nn`]: parameters and modules; [`optim`]: AdamW, schedules |
 //! | prove a gradient, of any function | [`gradcheck`] |
 //! | read the paper beside its code | [`monovit`]: encoder, decoder, pose network, loss |
+//! | put another depth network together | [`networks`]: encoders and decoders by name |
 //! | train depth | [`train`]: the recipe, the run; [`data`], [`street`]: where frames come from |
 //! | predict and measure depth | [`eval`]: predictor, metrics, attention; [`depth`], [`camera`]: its units |
 //! | read and write files | [`formats`]; [`weights`]: published and other weights |
@@ -46,6 +47,7 @@ pub mod eval;
 pub mod formats;
 pub mod gradcheck;
 pub mod monovit;
+pub mod networks;
 pub mod nn;
 pub mod ops;
 pub mod optim;

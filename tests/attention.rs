@@ -4,7 +4,8 @@
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use parallax::monovit::{Ablation, MonoVit, Preset};
+use parallax::monovit::{Ablation, Preset};
+use parallax::networks::DepthNetwork;
 use parallax::train::RunConfig;
 use parallax::train::run::write_weights;
 
@@ -21,7 +22,7 @@ impl Place {
     fn new(ablation: Ablation) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         let config = RunConfig { height: 64, width: 96, ablation, ..RunConfig::new(Preset::Pico, 10) };
-        let (_, params) = MonoVit::new(config.model(), 1);
+        let (_, params) = DepthNetwork::new(config.model(), 1);
         write_weights(&folder.path().join("weights.safetensors"), &params, &config.setup()).expect("written");
         let picture = image::RgbImage::from_fn(130, 70, |x, y| image::Rgb([x as u8, 2 * y as u8, (x * y % 251) as u8]));
         picture.save(folder.path().join("street.png")).expect("written");

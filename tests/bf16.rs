@@ -4,7 +4,8 @@
 //! sum of their sizes. Gradients are f32's: the bits of an op that was never told of bf16.
 
 use parallax::data::batch::to_tensor;
-use parallax::monovit::{MonoVit, Preset};
+use parallax::monovit::Preset;
+use parallax::networks::DepthNetwork;
 use parallax::nn::Folded;
 use parallax::ops::product::linear::Linear;
 use parallax::ops::{Conv2d, apply1};
@@ -90,7 +91,7 @@ fn the_whole_network_moves_by_less_than_is_seen() {
     let street = StreetConfig { height: 96, width: 320, sequences: 1, frames: 3, ..StreetConfig::default() };
     let street = Street::render(&street, None);
     let images = to_tensor(&[street.frame(0, 1).as_ref()]);
-    let (model, params) = MonoVit::new::<f32>(Preset::Nano.config(), 0);
+    let (model, params) = DepthNetwork::new::<f32>(Preset::Nano.config(), 0);
     let predict = |precision| model.predict(&Folded::new(&params).with_precision(precision), &images).swap_remove(0);
     let (exact, rounded) = (predict(Precision::F32), predict(Precision::Bf16));
     let off = exact.data().iter().zip(rounded.data()).map(|(x, y)| ((x - y) / x).abs());

@@ -10,13 +10,14 @@ use std::time::{Duration, Instant};
 use parallax::formats::TensorFile;
 use parallax::formats::pth;
 use parallax::formats::pth::Saved;
-use parallax::monovit::{MonoVit, Preset};
+use parallax::monovit::Preset;
+use parallax::networks::DepthNetwork;
 use parallax::nn::Params;
 use parallax::tensor::Tensor;
 use parallax::train::RunConfig;
 use parallax::train::run::load_weights;
 use parallax::train::start::Start;
-use parallax::weights::{Form, Need, Sources, Weights, load, preset_of, save};
+use parallax::weights::{Form, Need, Sources, Weights, architecture_of, load, save};
 
 fn fixture(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)
@@ -308,7 +309,7 @@ fn bad_files_are_refused_by_name_quickly_and_in_little_memory() {
             safetensors("{\"stem.a\":{\"dtype\":\"F8_E5M2\",\"shape\":[2],\"data_offsets\":[0,2]}}", 2),
             "stem.a holds F8_E5M2",
         ),
-        ("nothing.safetensors", safetensors("{}", 0), "none of MonoViT's weights"),
+        ("nothing.safetensors", safetensors("{}", 0), "no weights of a network of this program"),
         (
             "others.safetensors",
             safetensors("{\"a\":{\"dtype\":\"F32\",\"shape\":[2],\"data_offsets\":[0,8]}}", 8),
@@ -341,7 +342,7 @@ fn bad_files_are_refused_by_name_quickly_and_in_little_memory() {
         ("bad_bomb", "64 times"),
         ("bad_short_storage", "has "),
         ("bad_whole_model", "refers to"),
-        ("nothing", "none of MonoViT's weights"),
+        ("nothing", "no weights of a network of this program"),
     ];
     for (name, expected) in hostile {
         let error = refusal(&[fixture(&format!("pth/{name}.pth"))]);
@@ -454,7 +455,7 @@ fn networks_trained_on_imagenet_are_starts() {
         assert!(found[..3 * 49] == halves && found[3 * 49..] == halves);
     }
     let expected = expected();
-    let (_, untouched): (_, Params<f32>) = MonoVit::new(Preset::Pico.config(), config.seed);
+    let (_, untouched): (_, Params<f32>) = DepthNetwork::new(Preset::Pico.config(), config.seed);
     for ((_, p), (_, q)) in start.params.iter().zip(untouched.iter()) {
         let exported = bits(p.layout.export(&p.value).data());
         if p.name().starts_with("pose_encoder.") && !p.name().ends_with("encoder.conv1.weight") {
@@ -476,7 +477,7 @@ fn networks_trained_on_imagenet_are_starts() {
     names.sort_unstable();
     assert_eq!(found, names);
 
-    assert_eq!(preset_of(std::slice::from_ref(&mpvit)).expect("a size"), Preset::Pico);
+    assert_eq!(architecture_of(std::slice::from_ref(&mpvit)).expect("a size"), Preset::Pico.into());
     let nano = |encoder: Option<&PathBuf>, pose: Option<&PathBuf>| {
         let config =
             RunConfig { init_encoder: encoder.cloned(), init_pose: pose.cloned(), ..RunConfig::new(Preset::Nano, 10) };

@@ -8,7 +8,8 @@ use std::sync::Arc;
 use parallax::data::DataSource;
 use parallax::data::batch::{Augment, batch_of_step};
 use parallax::formats::safetensors;
-use parallax::monovit::{MonoVit, Preset};
+use parallax::monovit::Preset;
+use parallax::networks::DepthNetwork;
 use parallax::street::{Street, StreetConfig};
 use parallax::train::recipe::{RateDecay, RateSchedule};
 use parallax::train::rotations::Rotations;
@@ -45,7 +46,7 @@ type Named = (String, Vec<f32>);
 fn moments(place: &Path, batches: &[[usize; 2]], freeze: &str) -> Vec<Named> {
     let mut config = config();
     (config.loss.tie_break, config.auto_mask_delay) = (0.0, 0.0);
-    let (model, params) = MonoVit::new(config.model(), 0);
+    let (model, params) = DepthNetwork::new(config.model(), 0);
     let mut trainer = Trainer::of(model, params, config.plan());
     trainer.freeze(&[freeze.to_owned()]).expect("there are such");
     let (plain, street) = (Augment { flip: false, jitter: false, sensor: false }, street(1));
@@ -110,7 +111,7 @@ fn frozen_parameters_and_statistics_keep_their_bits_and_others_do_not() {
     let rotations = Rotations { share: 0.5, keep: 0.5, ..Rotations::default() };
     let freeze = ["encoder.*", "pose_encoder.*"].map(str::to_owned).to_vec();
     let config = RunConfig { rotations, freeze, steps: 4, checkpoint_every: 4, ..config() };
-    let (_, start) = MonoVit::new(config.model(), config.seed);
+    let (_, start) = DepthNetwork::new(config.model(), config.seed);
     finish(&mut Run::create(&folder, config).expect("a run"), &data());
     let last = safetensors::read::<f32>(&folder.join("last.safetensors")).expect("weights").tensors;
     let (mut kept, mut moved) = (0, 0);
@@ -129,7 +130,7 @@ fn frozen_parameters_and_statistics_keep_their_bits_and_others_do_not() {
 #[test]
 fn pose_networks_that_learn_first_leave_depth_alone_meanwhile() {
     let config = RunConfig { steps: 4, pose_first: 0.5, ..config() };
-    let (model, start) = MonoVit::new(config.model(), 0);
+    let (model, start) = DepthNetwork::new(config.model(), 0);
     let mut trainer = Trainer::of(model, start.clone(), config.plan());
     let street = street(1);
     let mut step = |i: u64| {

@@ -1,7 +1,8 @@
 //! What training costs is known beforehand. Memory is counted for the whole process, hence one test in a process of its own.
 
 use parallax::data::batch::Batch;
-use parallax::monovit::Preset;
+use parallax::monovit::{Ablation, Preset};
+use parallax::networks::{Architecture, Network};
 use parallax::nn::Context;
 use parallax::tensor::{Tensor, Var, pool, profile};
 use parallax::train::cost::{Cost, check_memory};
@@ -21,10 +22,14 @@ fn triplets(height: usize, width: usize, batch: usize) -> Batch {
 
 #[test]
 fn small_steps_tell_what_larger_ones_cost() {
-    let config = Preset::Pico.config();
-    for ([h, w], batch) in [([96, 160], 1), ([64, 96], 3), ([160, 64], 2), ([128, 256], 2)] {
-        let cost = Cost::of(&config, [h, w], batch, false).expect("counted");
-        let mut trainer = Trainer::new(config.clone(), RunConfig::usual().plan());
+    let pico = Preset::Pico;
+    let [monovit, monodepth2] = [pico.into(), Architecture::of(Network::Monodepth2, pico)]
+        .map(|architecture| architecture.config(&Ablation::default()).expect("a size"));
+    let sizes = [([96, 160], 1), ([64, 96], 3), ([160, 64], 2), ([128, 256], 2)];
+    let of_one = sizes.map(|(size, batch)| (size, batch, &monovit));
+    for ([h, w], batch, config) in of_one.into_iter().chain([([96, 160], 2, &monodepth2)]) {
+        let cost = Cost::of(config, [h, w], batch, false).expect("counted");
+        let mut trainer = Trainer::new(config, RunConfig::usual().plan());
         let data = triplets(h, w, batch);
         trainer.step(&data).expect("a first step");
         let (_, inference) = profile::record(false, || {

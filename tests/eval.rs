@@ -8,7 +8,8 @@ use std::sync::OnceLock;
 use parallax::data::DataSource;
 use parallax::data::kitti::{Kitti, Options};
 use parallax::formats::npy::write_npy_shaped;
-use parallax::monovit::{MonoVit, Preset};
+use parallax::monovit::Preset;
+use parallax::networks::DepthNetwork;
 use parallax::train::RunConfig;
 use parallax::train::run::write_weights;
 
@@ -24,7 +25,7 @@ fn made() -> &'static (PathBuf, PathBuf) {
         let output = parallax(&[&["data", "street", "--out", text(&street)][..], &size].concat());
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         let config = RunConfig { height: 64, width: 96, ..RunConfig::new(Preset::Pico, 1) };
-        let (_, params) = MonoVit::new::<f32>(config.model(), 11);
+        let (_, params) = DepthNetwork::new::<f32>(config.model(), 11);
         write_weights(&weights, &params, &config.setup()).expect("weights");
         (street, weights)
     })
@@ -211,7 +212,7 @@ fn the_cameras_height_gives_the_scale_without_ground_truth() {
 fn other_weights(place: &Path) -> PathBuf {
     let path = place.join("other.safetensors");
     let config = RunConfig { height: 64, width: 96, ..RunConfig::new(Preset::Pico, 1) };
-    let (_, params) = MonoVit::new::<f32>(config.model(), 12);
+    let (_, params) = DepthNetwork::new::<f32>(config.model(), 12);
     write_weights(&path, &params, &config.setup()).expect("weights");
     path
 }

@@ -9,7 +9,8 @@ use std::sync::OnceLock;
 
 use image::{DynamicImage, GenericImageView, ImageFormat, Rgb, RgbImage};
 use parallax::eval::predictor::Predictor;
-use parallax::monovit::{MonoVit, Preset};
+use parallax::monovit::Preset;
+use parallax::networks::DepthNetwork;
 use parallax::nn::Context;
 use parallax::tensor::{Tensor, Var, parallel, pool};
 use parallax::train::RunConfig;
@@ -26,7 +27,7 @@ fn weights() -> &'static Path {
         let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join("predict/pico.safetensors");
         let usual = RunConfig::new(Preset::Pico, 1);
         let config = RunConfig { height: HEIGHT as usize, width: WIDTH as usize, ..usual };
-        let (_, params) = MonoVit::new::<f32>(config.model(), 11);
+        let (_, params) = DepthNetwork::new::<f32>(config.model(), 11);
         write_weights(&path, &params, &config.setup()).expect("weights");
         path
     })

@@ -1,7 +1,8 @@
 //! Transformer layers that are computed again in the backward pass: the same training, in less memory.
 
 use parallax::data::batch::{Augment, Batch, batch_of_step};
-use parallax::monovit::{MonoVit, Preset};
+use parallax::monovit::Preset;
+use parallax::networks::DepthNetwork;
 use parallax::nn::{Context, ParamId};
 use parallax::random::Random;
 use parallax::street::{Street, StreetConfig};
@@ -27,7 +28,7 @@ struct Taken {
 /// Gradients of the disparities' squares, of a network whose layers are dropped half of the time.
 fn taken(recomputing: bool) -> Taken {
     let config = parallax::monovit::Config { drop_path: 0.5, ..Preset::Pico.config() };
-    let (model, params) = MonoVit::new::<f64>(config, 3);
+    let (model, params) = DepthNetwork::new::<f64>(config, 3);
     let (tape, image) = (Tape::new(), batch().target.cast());
     let c = Context::training(&params, &tape, Random::new(5, 0)).recomputing(recomputing);
     let disparities = model.disparities(&c, &Var::constant(image));
@@ -74,7 +75,7 @@ fn a_step_has_the_same_loss_and_takes_less_memory() {
     assert!((once.0.loss - twice.0.loss).abs() <= 1e-5 * once.0.loss, "{:?} {:?}", once.0, twice.0);
     assert!((once.0.grad_norm / twice.0.grad_norm - 1.0).abs() < 1e-3, "{:?} {:?}", once.0, twice.0);
     assert!((twice.1 as f64) < 0.9 * once.1 as f64, "{} bytes for {}", twice.1, once.1);
-    let cost = |recompute| Cost::of(&Preset::Nano.config(), [64, 96], 2, recompute).expect("counted");
+    let cost = |recompute| Cost::of(Preset::Nano.config(), [64, 96], 2, recompute).expect("counted");
     let (once, twice) = (cost(false), cost(true));
     assert!(twice.bytes_step < once.bytes_step, "{once:?} {twice:?}");
     assert!(twice.flops_step > once.flops_step && twice.flops_inference == once.flops_inference, "{once:?} {twice:?}");

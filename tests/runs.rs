@@ -477,7 +477,7 @@ fn flags_of_ablations_win_over_the_configuration_and_are_written_into_the_run() 
     let output = parallax(&[&["train", "--config", &config, "--out", &run][..], &networks, &loss].concat());
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let written = read_config(&place.path().join("run/config.toml")).expect("read");
-    assert_eq!(written.model().paths, [1; 4]);
+    assert_eq!(written.model().mpvit().map(|sizes| sizes.paths), Some([1; 4]));
     assert_eq!((written.ablation.decoder_attention, written.ablation.drop_path), (false, Some(0.5)));
     assert_eq!((written.loss.reprojection, written.loss.scales), (Reprojection::Average, Scales::Own));
     assert_eq!((written.loss.auto_mask, written.loss.ssim), (false, 0.0));

@@ -13,7 +13,8 @@ use parallax::eval::mean_map::MeanMap;
 use parallax::eval::metrics::{Protocol, Scale};
 use parallax::eval::predictor::Predictor;
 use parallax::formats::npy;
-use parallax::monovit::{MonoVit, Preset};
+use parallax::monovit::Preset;
+use parallax::networks::DepthNetwork;
 use parallax::street::{Street, StreetConfig};
 use parallax::train::RunConfig;
 use parallax::train::run::write_weights;
@@ -150,7 +151,7 @@ fn run_of(place: &Path, preset: Preset) -> PathBuf {
     let run = place.join(preset.name());
     fs::create_dir(&run).expect("made");
     let config = RunConfig { height: 64, width: 96, ..RunConfig::new(preset, 7) };
-    let (_, params) = MonoVit::new::<f32>(config.model(), 3);
+    let (_, params) = DepthNetwork::new::<f32>(config.model(), 3);
     write_weights(&run.join("best.safetensors"), &params, &config.setup()).expect("written");
     fs::write(run.join("config.toml"), toml::to_string(&config).expect("TOML")).expect("written");
     run
@@ -192,11 +193,11 @@ fn a_run_becomes_a_file_to_ship() {
 
 #[test]
 fn a_network_that_is_too_large_is_not_shipped() {
-    let (model, params) = MonoVit::new::<f32>(Preset::Tiny.config(), 0);
+    let (model, params) = DepthNetwork::new::<f32>(Preset::Tiny.config(), 0);
     let shipped = shipped();
     let mut report = shipped.report;
     report.matched = params.iter().map(|(_, p)| p.name().to_owned()).collect();
-    let setup = parallax::monovit::Setup::of(Preset::Tiny);
+    let setup = parallax::networks::Setup::of(Preset::Tiny);
     let large = Weights { model, params, setup, report, origin: None };
     let place = tempfile::tempdir().expect("a folder");
     let path = place.path().join("large.safetensors");

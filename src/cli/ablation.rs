@@ -1,8 +1,9 @@
 //! The switches of the paper's ablation study, as flags.
 
 use parallax::Result;
+use parallax::monovit::Ablation;
 use parallax::monovit::loss::{LossConfig, Reprojection, Scales};
-use parallax::monovit::{Ablation, Config, Preset};
+use parallax::networks::{Architecture, Config};
 
 /// What is taken away from the networks.
 #[derive(clap::Args, Clone)]
@@ -37,12 +38,11 @@ impl Networks {
         ablation.drop_path = self.drop_path.or(ablation.drop_path);
     }
 
-    /// What is left of a named size.
-    pub fn config(&self, preset: Preset) -> Result<Config> {
+    /// What is left of named networks.
+    pub fn config(&self, architecture: Architecture) -> Result<Config> {
         let mut ablation = Ablation::default();
         self.apply(&mut ablation);
-        ablation.check(&preset.config())?;
-        Ok(ablation.apply(preset.config()))
+        architecture.config(&ablation)
     }
 }
 

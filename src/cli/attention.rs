@@ -10,6 +10,7 @@ use parallax::eval::attention::{Attention, AttentionRows, attention, saliency};
 use parallax::formats::atomic::check_writable;
 use parallax::formats::picture::{check_picture, read_picture};
 use parallax::formats::png::write_png;
+use parallax::networks::EncoderKind;
 use parallax::report::overlay::{Overlay, mark};
 use parallax::tensor::{Tensor, profile};
 use parallax::train::run::load_weights;
@@ -167,7 +168,11 @@ pub fn run(args: Args) -> Result<()> {
         return super::print_json(&written);
     }
     if written.maps.is_empty() {
-        say!("these networks have no transformer paths: the disparities and the saliency are all there is to see");
+        let what = match setup.encoder {
+            EncoderKind::Mpvit => "these networks have no transformer paths".to_owned(),
+            other => format!("the encoder {} has no attention", other.name()),
+        };
+        say!("{what}: the disparities and the saliency are all there is to see");
     }
     say!("{} is the sheet; {} more pictures beside it", written.sheet.display(), written.maps.len() + 1);
     Ok(())

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use parallax::monovit::setup::check_size;
+use parallax::networks::setup::check_size;
 use parallax::weights;
 use parallax::weights::{Form, Need, Sources};
 use parallax::{Error, Result};

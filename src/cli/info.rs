@@ -1,7 +1,7 @@
 //! `parallax info`.
 
 use parallax::Result;
-use parallax::monovit::MonoVit;
+use parallax::networks::DepthNetwork;
 use parallax::tensor::parallel;
 use parallax::train::cost::Cost;
 use serde::Serialize;
@@ -39,9 +39,10 @@ struct Info {
 pub fn run(args: Args) -> Result<()> {
     let Args { sizes: args, networks } = args;
     args.check()?;
-    let config = networks.config(args.preset)?;
+    let architecture = args.architecture()?;
+    let config = networks.config(architecture)?;
     let cost = Cost::of(&config, [args.height, args.width], args.batch, args.recompute)?;
-    let (_, params) = MonoVit::new::<f32>(config, 0);
+    let (_, params) = DepthNetwork::new::<f32>(config, 0);
     let part = |prefix: &str| params.count(prefix);
     let parameters = Parameters {
         encoder: part("encoder."),
@@ -62,7 +63,7 @@ pub fn run(args: Args) -> Result<()> {
         return super::print_json(&info);
     }
     let p = &info.parameters;
-    say!("{} at {}x{}, batch {}", args.preset.name(), args.width, args.height, args.batch);
+    say!("{} at {}x{}, batch {}", architecture.name(), args.width, args.height, args.batch);
     for (name, n) in [("encoder", p.encoder), ("depth", p.depth), ("pose encoder", p.pose_encoder), ("pose", p.pose)] {
         say!("{name:14} {n:>12} parameters");
     }

@@ -11,6 +11,7 @@ macro_rules! note {
 }
 
 mod ablation;
+mod architecture;
 mod attention;
 mod bench;
 mod camera;

@@ -1,15 +1,17 @@
 //! The flags that say what is run: shared by the commands that need no data.
 
 use parallax::Result;
-use parallax::monovit::Preset;
-use parallax::monovit::setup::check_size;
+use parallax::monovit::Ablation;
+use parallax::networks::Architecture;
+use parallax::networks::setup::check_size;
 use parallax::tensor::Precision;
+
+use super::architecture::ArchitectureArgs;
 
 #[derive(clap::Args, Clone)]
 pub struct Sizes {
-    /// Size of the networks.
-    #[arg(long, default_value = "nano")]
-    pub preset: Preset,
+    #[command(flatten)]
+    pub networks: ArchitectureArgs,
     /// Height of the pictures, a multiple of 32.
     #[arg(long, value_name = "PIXELS", default_value_t = 96)]
     pub height: usize,
@@ -28,6 +30,14 @@ pub struct Sizes {
 }
 
 impl Sizes {
+    /// The networks that are asked for.
+    ///
+    /// # Errors
+    /// If flags contradict one another.
+    pub fn architecture(&self) -> Result<Architecture> {
+        self.networks.get()
+    }
+
     /// Whether the networks can be run at these sizes.
     pub fn check(&self) -> Result<()> {
         check_size("--height", self.height)?;
@@ -35,7 +45,7 @@ impl Sizes {
         if self.batch == 0 {
             return Err(parallax::Error::setting("--batch", "at least 1"));
         }
-        Ok(())
+        self.architecture()?.config(&Ablation::default()).map(drop)
     }
 }
 

@@ -6,7 +6,8 @@ use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
 use parallax::data::apart::neighbours;
-use parallax::monovit::{Preset, Setup};
+use parallax::monovit::Preset;
+use parallax::networks::{Architecture, Setup};
 use parallax::train::cost::check_memory;
 use parallax::train::data::{self, is_rendered};
 use parallax::train::fit::{Fitted, fit_memory};
@@ -15,10 +16,11 @@ use parallax::train::layers::Layers;
 use parallax::train::recipe::{RunConfig, STEPS};
 use parallax::train::run::{Ended, Event, Run, RunData, RunMetrics};
 use parallax::train::start::Start;
-use parallax::weights::{self, SHIPPED, preset_of};
+use parallax::weights::{self, SHIPPED, architecture_of};
 use parallax::{Error, Result};
 
 use super::ablation;
+use super::architecture::{ArchitectureArgs, Said};
 use super::camera::CameraArgs;
 use super::control::Control;
 use super::film::FilmArgs;
@@ -59,9 +61,8 @@ pub struct Args {
     prepared: Option<PathBuf>,
     #[command(flatten)]
     lens: CameraArgs,
-    /// Size of the networks [default: nano, or that of the weights to start from].
-    #[arg(long)]
-    preset: Option<Preset>,
+    #[command(flatten)]
+    architecture: ArchitectureArgs,
     /// Height of the pictures that the networks see, a multiple of 32 [default: 96, or that of the weights to start
     /// from].
     #[arg(long, value_name = "PIXELS")]
@@ -116,7 +117,7 @@ pub struct Args {
     /// times for several files; `shipped`: those inside the program [default: random weights].
     #[arg(long, value_name = "FILE|DIR")]
     init: Vec<PathBuf>,
-    /// Weights of an MPViT that was trained on ImageNet, for the depth encoder to start from.
+    /// Weights of an MPViT or a ResNet (torchvision's) that was trained on ImageNet, for the depth encoder to start from.
     #[arg(long, value_name = "FILE")]
     init_encoder: Option<PathBuf>,
     /// Weights of a ResNet-18 that was trained on ImageNet (torchvision's), for the pose encoder to start from.
@@ -130,7 +131,7 @@ pub struct Args {
     #[arg(long)]
     skip_bad_frames: bool,
     /// Continue this run: an interrupted one, or with --steps a finished one.
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "config", "recipe", "init", "init_encoder", "init_pose", "split", "preset"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "config", "recipe", "init", "init_encoder", "init_pose", "split", "preset", "network", "encoder"])]
     resume: Option<PathBuf>,
     /// Folder of the run, new or empty [default: the first of runs/1, runs/2, ... that does not exist].
     #[arg(long, value_name = "RUN")]
@@ -163,7 +164,7 @@ pub fn run(args: Args) -> Result<()> {
     };
     note!(
         "training {} on {} samples, {} steps of {}; everything goes to {}",
-        run.config.preset.name(),
+        run.config.architecture().name(),
         data.train.len(),
         run.config.steps,
         run.config.batch,
@@ -443,21 +444,26 @@ fn absolute(data: &str) -> String {
 
 fn configuration(args: &Args) -> Result<RunConfig> {
     let layers = Layers::read(args.recipe.as_deref(), args.config.as_deref())?;
-    let said = args.preset.map_or_else(|| layers.preset(), |preset| Ok(Some(preset)))?;
+    let said = Said { preset: layers.preset()?, network: layers.network()?, encoder: layers.encoder()? };
+    let said = args.architecture.over(said)?;
     let defaults = if !args.init.is_empty() {
         // Where weights do not say it the preset does; whether they fit it is found out when they are read.
-        let setup = weights::setup_of(&args.init).or_else(|e| said.map(Setup::of).ok_or(e))?;
+        let named = said.preset.map(|preset| Setup::of(said.or(preset)));
+        let setup = weights::setup_of(&args.init).or_else(|e| named.ok_or(e))?;
         RunConfig::from_weights(setup, STEPS)
     } else if args.init_encoder.is_some() {
-        RunConfig::from_encoder(preset(args, said)?, STEPS)
+        RunConfig::from_encoder(architecture(args, said)?, STEPS)
     } else {
-        RunConfig::new(preset(args, said)?, STEPS)
+        RunConfig::new(architecture(args, said)?, STEPS)
     };
     let mut c = layers.over(&defaults)?;
     macro_rules! take {
         ($($field:ident),*) => {$(if let Some(value) = args.$field.clone() { c.$field = value; })*};
     }
-    take!(data, preset, height, width, batch, seed, steps, log_every, checkpoint_every);
+    let asked = said.or(c.architecture());
+    (c.preset, c.network) = (asked.preset, asked.network);
+    c.encoder = (asked.encoder != asked.network.usual_encoder()).then_some(asked.encoder);
+    take!(data, height, width, batch, seed, steps, log_every, checkpoint_every);
     if args.epochs.is_some() || args.steps.is_some() {
         c.epochs = args.epochs;
     }
@@ -504,12 +510,11 @@ fn configuration(args: &Args) -> Result<RunConfig> {
     Ok(c)
 }
 
-/// The preset that was asked for; without, that of the encoder to start from; without one, the reduced one.
-fn preset(args: &Args, said: Option<Preset>) -> Result<Preset> {
-    match (said, &args.init_encoder) {
-        (Some(preset), _) => Ok(preset),
-        (None, None) => Ok(Preset::Nano),
-        (None, Some(file)) => preset_of(std::slice::from_ref(file)),
+/// The networks that were asked for; where no size was, those of the encoder to start from; without one, the reduced ones.
+fn architecture(args: &Args, said: Said) -> Result<Architecture> {
+    match (said.preset, &args.init_encoder) {
+        (None, Some(file)) => Ok(said.or(architecture_of(std::slice::from_ref(file))?)),
+        _ => Ok(said.or(Preset::Nano)),
     }
 }
 

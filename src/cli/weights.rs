@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use parallax::Result;
-use parallax::monovit::setup::check_size;
+use parallax::networks::setup::check_size;
 use parallax::weights;
 use parallax::weights::{Need, SHIPPED, Sources, Weights};
 

@@ -15,7 +15,7 @@
 //! The convolutional relative position encoding, which is added to this output, is left out: it multiplies q with a
 //! window of 3, 5 or 7 tokens around it, with other weights in every channel, and so has no row that a head shares.
 
-use crate::monovit::MonoVit;
+use crate::networks::DepthNetwork;
 use crate::nn::{Context, Params};
 use crate::tensor::{Float, Tape, Tensor, Var};
 
@@ -66,31 +66,34 @@ pub struct Attention<T: Float> {
 }
 
 /// The effective rows of a pixel (its row and column) in every transformer layer, in evaluation mode, for an image
-/// `[1, H, W, 3]` with sides that are multiples of 32.
+/// `[1, H, W, 3]` with sides that are multiples of 32. A network without attention has no rows.
 ///
 /// # Panics
 /// If the image holds more than one sample, or the pixel lies outside it.
 #[track_caller]
-pub fn attention<T: Float>(model: &MonoVit, params: &Params<T>, image: &Tensor<T>, pixel: [usize; 2]) -> Attention<T> {
+pub fn attention<T: Float>(
+    model: &DepthNetwork,
+    params: &Params<T>,
+    image: &Tensor<T>,
+    pixel: [usize; 2],
+) -> Attention<T> {
     let [height, width] = one_image_with(image, pixel);
     let c = Context::inference(params).observed();
     let disparities = model.disparities(&c, &image.clone().into());
     let mut rows = Vec::new();
+    let Some(sizes) = model.config.mpvit() else {
+        return Attention { disparities: disparities.into_iter().map(Var::into_value).collect(), rows };
+    };
     for stage in 0..4 {
         let [h, w] = [height, width].map(|side| side >> (stage + 2));
         let token = pixel.map(|x| x >> (stage + 2));
-        for path in 0..model.config.paths[stage] {
-            for layer in 0..model.config.layers[stage] {
+        for path in 0..sizes.paths[stage] {
+            for layer in 0..sizes.layers[stage] {
                 let name = format!("{}.factoratt_crpe.qkv", layer_name(stage, path, layer));
                 let qkv = c.take_observed(&name).expect("every layer shows its q, k and v");
-                let heads = effective_rows(&qkv, model.config.heads, token[0] * w + token[1]);
-                rows.push(AttentionRows {
-                    stage,
-                    path,
-                    layer,
-                    token,
-                    heads: heads.reshape([model.config.heads, h, w]),
-                });
+                let heads = effective_rows(&qkv, sizes.heads, token[0] * w + token[1]);
+                let heads = heads.reshape([sizes.heads, h, w]);
+                rows.push(AttentionRows { stage, path, layer, token, heads });
             }
         }
     }
@@ -139,7 +142,7 @@ pub fn effective_rows<T: Float>(qkv: &Tensor<T>, heads: usize, token: usize) -> 
 /// If the image holds more than one sample, or the pixel lies outside it.
 #[track_caller]
 pub fn saliency<T: Float>(
-    model: &MonoVit,
+    model: &DepthNetwork,
     params: &Params<T>,
     image: &Tensor<T>,
     pixel: [usize; 2],
@@ -218,7 +221,7 @@ mod tests {
 
     #[test]
     fn every_layer_of_a_network_shows_rows_that_give_its_output() {
-        let (model, params) = MonoVit::new::<f64>(Preset::Pico.config(), 1);
+        let (model, params) = DepthNetwork::new::<f64>(Preset::Pico.config(), 1);
         let image = uniform(&[1, 64, 96, 3], 0.0, 1.0);
         let pixel = [40, 90];
         let found = attention(&model, &params, &image, pixel);
@@ -251,7 +254,7 @@ mod tests {
 
     #[test]
     fn saliency_is_what_finite_differences_say() {
-        let (model, mut params) = MonoVit::new::<f64>(Preset::Pico.config(), 1);
+        let (model, mut params) = DepthNetwork::new::<f64>(Preset::Pico.config(), 1);
         // Four channels lead to the full-size disparity, behind a ReLU: lifted, none of them is dead.
         let last = params.find("depth.convs.X_04_attention.conv_se.bias").expect("the last node");
         params.value_mut(last).data_mut().fill(0.5);

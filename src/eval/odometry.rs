@@ -5,21 +5,21 @@ use image::RgbImage;
 use super::trajectory::Pose;
 use crate::data::batch::to_tensor;
 use crate::data::resize::lanczos;
-use crate::monovit::{MonoVit, Setup};
+use crate::networks::{DepthNetwork, Setup};
 use crate::nn::{Context, Folded, Params};
 use crate::tensor::Var;
 use crate::{Error, Result};
 
 /// The pose network with weights in evaluation mode.
 pub struct Odometry {
-    model: MonoVit,
+    model: DepthNetwork,
     params: Folded<f32>,
     setup: Setup,
 }
 
 impl Odometry {
     /// That of these weights, which have to hold the pose networks.
-    pub fn new(model: &MonoVit, params: &Params<f32>, setup: &Setup) -> Self {
+    pub fn new(model: &DepthNetwork, params: &Params<f32>, setup: &Setup) -> Self {
         Odometry { model: model.clone(), params: Folded::new(params), setup: *setup }
     }
 
@@ -106,7 +106,7 @@ mod tests {
     fn a_path_has_a_pose_for_every_frame_and_is_what_the_pairs_say() {
         let street = StreetConfig { height: 64, width: 96, sequences: 1, frames: 4, ..StreetConfig::default() };
         let street = Street::render(&street, None);
-        let (model, params) = MonoVit::new(Preset::Pico.config(), 1);
+        let (model, params) = DepthNetwork::new(Preset::Pico.config(), 1);
         let odometry = Odometry::new(&model, &params, &Setup { height: 64, width: 96, ..Setup::of(Preset::Pico) });
         let frames = || (0..4).map(|i| Ok(street.frame(0, i).as_ref().clone()));
         let path = odometry.path(frames(), 1.0).unwrap();

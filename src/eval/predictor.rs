@@ -9,7 +9,7 @@ use crate::data::batch::to_tensor;
 use crate::data::resize::lanczos;
 use crate::depth::{Disparity, InverseDepth};
 use crate::error::{Error, Result};
-use crate::monovit::{MonoVit, Setup};
+use crate::networks::{DepthNetwork, Setup};
 use crate::nn::{Folded, Params};
 use crate::tensor::{Precision, profile};
 use crate::weights::{self, Need, Weights};
@@ -27,7 +27,7 @@ use image::RgbImage;
 /// # Ok::<(), parallax::Error>(())
 /// ```
 pub struct Predictor {
-    model: MonoVit,
+    model: DepthNetwork,
     params: Folded<f32>,
     setup: Setup,
 }
@@ -43,7 +43,7 @@ pub struct Prediction {
 
 impl Predictor {
     /// The networks with these weights; `setup` gives the size of their pictures and the range of depths.
-    pub fn new(model: &MonoVit, params: &Params<f32>, setup: &Setup) -> Self {
+    pub fn new(model: &DepthNetwork, params: &Params<f32>, setup: &Setup) -> Self {
         Predictor { model: model.clone(), params: Folded::new(params), setup: *setup }
     }
 
@@ -139,7 +139,7 @@ mod tests {
     #[test]
     fn weights_that_overflow_are_named_by_the_op_that_did() {
         let setup = Setup { height: 64, width: 96, ..Setup::of(Preset::Pico) };
-        let (model, mut params) = MonoVit::new::<f32>(setup.model(), 0);
+        let (model, mut params) = DepthNetwork::new::<f32>(setup.model(), 0);
         let picture = RgbImage::from_fn(96, 64, |x, y| image::Rgb([x as u8, y as u8, 90]));
         assert!(Predictor::new(&model, &params, &setup).depth_of(&picture).is_ok());
         let (id, huge) = params

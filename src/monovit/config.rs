@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::decoder::DecoderConfig;
+use super::pose::PoseConfig;
 use crate::error::{Error, Result};
 use crate::nn::Start;
 
@@ -220,16 +222,18 @@ impl Config {
         [d[0], d[1], d[2], d[3], d[3]]
     }
 
-    /// Channels e of the decoder's first column: what the encoder's maps are brought to.
-    pub fn lateral_channels(&self) -> [usize; 5] {
-        let w = self.channels[0];
-        [w, w, 2 * w, 4 * w, 8 * w]
+    /// Sizes of the decoder behind this encoder.
+    pub fn decoder(&self) -> DecoderConfig {
+        DecoderConfig {
+            features: self.feature_channels(),
+            attention: self.decoder_attention,
+            reduction: self.reduction,
+        }
     }
 
-    /// Channels d of the decoder's nodes, by level.
-    pub fn decoder_channels(&self) -> [usize; 5] {
-        let w = self.channels[0];
-        [w / 4, w / 2, w, 2 * w, 4 * w]
+    /// Sizes of the pose network.
+    pub fn pose(&self) -> PoseConfig {
+        PoseConfig { width: self.pose_width, squeeze: self.pose_squeeze }
     }
 }
 

@@ -6,10 +6,35 @@
 
 use std::collections::BTreeMap;
 
-use super::config::Config;
 use crate::nn::{Builder, Context, Conv, ConvStart, Init, Joined, Linear};
 use crate::ops::{Activation, Conv2d};
 use crate::tensor::{Float, Var};
+
+/// Sizes of the decoder.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct DecoderConfig {
+    /// Channels of the encoder's five maps, largest map first; those of the first are a multiple of 4, and decide the widths
+    /// of all nodes.
+    pub features: [usize; 5],
+    /// Whether channels are weighed by attention; without, the convolutions behind it stand alone.
+    pub attention: bool,
+    /// Reduction ratio of the channel attention.
+    pub reduction: usize,
+}
+
+impl DecoderConfig {
+    /// Channels e of the first column: what the encoder's maps are brought to.
+    pub fn lateral_channels(&self) -> [usize; 5] {
+        let w = self.features[0];
+        [w, w, 2 * w, 4 * w, 8 * w]
+    }
+
+    /// Channels d of the nodes, by level.
+    pub fn node_channels(&self) -> [usize; 5] {
+        let w = self.features[0];
+        [w / 4, w / 2, w, 2 * w, 4 * w]
+    }
+}
 
 /// Depth decoder: from the five maps of the encoder to disparities (sigmoid, in [0, 1]) at 1, 1/2, 1/4, 1/8 of the
 /// image.
@@ -39,9 +64,9 @@ fn on_diagonal((i, j): (usize, usize)) -> bool {
 
 impl Decoder {
     /// The parameters stand directly under the builder's path.
-    pub fn new<T: Float>(b: &mut Builder<T>, config: &Config) -> Self {
+    pub fn new<T: Float>(b: &mut Builder<T>, config: &DecoderConfig) -> Self {
         let b = &mut b.at("convs");
-        let (features, e, d) = (config.feature_channels(), config.lateral_channels(), config.decoder_channels());
+        let (features, e, d) = (config.features, config.lateral_channels(), config.node_channels());
         // Channels of node (i, j).
         let width = |i: usize, j: usize| match j {
             0 => e[i],
@@ -116,23 +141,30 @@ impl Decoder {
         let inputs = [&full, last, &nodes[&(1, 3)], &nodes[&(2, 2)]];
         self.heads.iter().zip(inputs).map(|(head, x)| head.forward(c, x).sigmoid()).collect()
     }
+
+    /// The convolutions whose sigmoid the disparities are, largest first.
+    pub fn heads(&self) -> &[Conv] {
+        &self.heads
+    }
 }
 
 /// A 3x3 convolution with bias over mirrored padding; `conv` in a checkpoint.
-fn conv3x3<T: Float>(b: &mut Builder<T>, channels: [usize; 2]) -> Conv {
+pub(crate) fn conv3x3<T: Float>(b: &mut Builder<T>, channels: [usize; 2]) -> Conv {
     Conv::new(&mut b.at("conv"), channels, 3, Conv2d::padded(1).reflecting(), ConvStart::FanInWithBias)
 }
 
 /// A 3x3 convolution over mirrored padding, and ELU.
 #[derive(Clone, Debug)]
-struct ConvBlock(Conv);
+pub(crate) struct ConvBlock(Conv);
 
 impl ConvBlock {
-    fn new<T: Float>(b: &mut Builder<T>, channels: [usize; 2]) -> Self {
+    /// From and to so many channels; the parameters stand under `conv` below the builder's path.
+    pub(crate) fn new<T: Float>(b: &mut Builder<T>, channels: [usize; 2]) -> Self {
         ConvBlock(conv3x3(&mut b.at("conv"), channels).activated(Activation::Elu))
     }
 
-    fn forward<T: Float>(&self, c: &Context<T>, joined: &Joined<T>) -> Var<T> {
+    /// `[B, H, W, in] -> [B, H, W, out]`.
+    pub(crate) fn forward<T: Float>(&self, c: &Context<T>, joined: &Joined<T>) -> Var<T> {
         self.0.forward_joined(c, joined, None)
     }
 }
@@ -145,10 +177,16 @@ struct AttentionConv {
 }
 
 impl AttentionConv {
-    fn new<T: Float>(b: &mut Builder<T>, channels: [usize; 2], config: &Config, fc: &str, kernel: usize) -> Self {
+    fn new<T: Float>(
+        b: &mut Builder<T>,
+        channels: [usize; 2],
+        config: &DecoderConfig,
+        fc: &str,
+        kernel: usize,
+    ) -> Self {
         let [inputs, _] = channels;
         let attention =
-            config.decoder_attention.then(|| ChannelAttention::new(&mut b.at(fc), inputs, inputs / config.reduction));
+            config.attention.then(|| ChannelAttention::new(&mut b.at(fc), inputs, inputs / config.reduction));
         let op = Conv2d::padded(kernel / 2).activated(Activation::Relu);
         let conv = Conv::new(&mut b.at("conv_se"), channels, kernel, op, ConvStart::FanInWithBias);
         AttentionConv { attention, conv }

@@ -5,7 +5,6 @@ use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
-use super::setup::check_depths;
 use super::supervision::depth_error;
 use crate::error::{Error, Result};
 use crate::random::Random;
@@ -298,6 +297,17 @@ impl Reprojection {
 fn mean_minimum<T: Float>(errors: &[Var<T>]) -> f64 {
     let maps: Vec<Var<T>> = errors.iter().map(Var::detach).collect();
     if maps.is_empty() { 0.0 } else { Var::min_reprojection(&maps.iter().collect::<Vec<_>>()).0.value().item().f64() }
+}
+
+/// Checks a range of depths.
+///
+/// # Errors
+/// If it is empty, or reaches 0 or infinity.
+pub(crate) fn check_depths(field: &str, min: f64, max: f64) -> Result<()> {
+    if min > 0.0 && min < max && max.is_finite() {
+        return Ok(());
+    }
+    Err(Error::setting(field, format!("{min} to {max} is no range of depths above 0")))
 }
 
 #[cfg(test)]

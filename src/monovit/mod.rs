@@ -10,16 +10,14 @@
 //! | photometric error (SSIM and L1), minimum over sources, auto-mask | [`loss`] |
 //! | edge-aware smoothness; the total over four scales | [`loss`] |
 //! | sizes of the networks; switches of the ablation study | [`config`] |
+//!
+//! [`crate::networks`] puts encoder, decoder and pose network together, and holds those that the paper compares with.
 
 pub mod config;
 pub mod decoder;
 pub mod encoder;
 pub mod loss;
-mod model;
 pub mod pose;
-pub mod setup;
 pub mod supervision;
 
 pub use config::{Ablation, Config, Preset};
-pub use model::MonoVit;
-pub use setup::Setup;

@@ -94,6 +94,11 @@ impl Conv {
         }
     }
 
+    /// Its bias, if it has one.
+    pub fn bias(&self) -> Option<ParamId> {
+        self.bias
+    }
+
     /// This convolution with an activation applied to its result.
     pub fn activated(mut self, activation: Activation) -> Self {
         self.op = self.op.activated(activation);

@@ -12,6 +12,7 @@ mod init;
 mod linear;
 mod norm;
 mod params;
+mod resnet;
 
 pub use context::Context;
 pub use conv::{Conv, ConvBn, ConvStart, DepthwiseConv, Joined, Normalised};
@@ -22,3 +23,4 @@ pub use linear::Linear;
 pub use norm::{BatchNorm, LayerNorm};
 pub use params::{Builder, Layout, Param, ParamId, Params};
 pub(crate) use params::{Identity, same_model};
+pub use resnet::{ResNet, ResNetLayers};

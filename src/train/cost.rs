@@ -13,7 +13,7 @@ use super::recipe::{Plan, RunConfig};
 use super::trainer::Trainer;
 use crate::data::batch::Batch;
 use crate::error::{Error, Result};
-use crate::monovit::Config;
+use crate::networks::Config;
 use crate::nn::Context;
 use crate::random::{Random, Stream};
 use crate::tensor::{Shape, Tensor, Var, pool, profile};
@@ -53,9 +53,9 @@ impl Cost {
     ///
     /// # Errors
     /// If a step on small pictures cannot be taken.
-    pub fn of(config: &Config, [height, width]: [usize; 2], batch: usize, recompute: bool) -> Result<Cost> {
+    pub fn of(config: impl Into<Config>, [height, width]: [usize; 2], batch: usize, recompute: bool) -> Result<Cost> {
         let plan = Plan { recompute, ..RunConfig::usual().plan() };
-        let mut trainer = Trainer::new(config.clone(), plan);
+        let mut trainer = Trainer::new(config, plan);
         let parameters = 4.0 * trainer.params.count("") as f64;
         let [small, large] = SMALL;
         let mut count = |h: usize, w: usize, batch: usize| Self::count(&mut trainer, [h, w], batch);
@@ -117,8 +117,8 @@ pub fn check_memory(config: &RunConfig) -> Result<()> {
     if held + MOST_PARAMETERS + MOST_A_PIXEL * (config.batch * config.height * config.width) as f64 <= free {
         return Ok(());
     }
-    let network = config.ablation.apply(config.preset.config());
-    let cost = Cost::of(&network, [config.height, config.width], config.batch, config.recompute)?;
+    let network = config.architecture().config(&config.ablation)?;
+    let cost = Cost::of(network, [config.height, config.width], config.batch, config.recompute)?;
     let needed = held + cost.bytes_step;
     if needed <= free {
         return Ok(());
@@ -129,7 +129,7 @@ pub fn check_memory(config: &RunConfig) -> Result<()> {
         format!(
             "training {} at {}x{}, batch {}, needs about {:.1} GiB, and {:.1} GiB are free: take a smaller \
              batch, smaller pictures or a smaller preset{}",
-            config.preset.name(),
+            config.architecture().name(),
             config.width,
             config.height,
             config.batch,

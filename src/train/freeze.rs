@@ -61,7 +61,8 @@ fn matches(pattern: &str, name: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::monovit::{MonoVit, Preset};
+    use crate::monovit::Preset;
+    use crate::networks::DepthNetwork;
 
     #[test]
     fn a_star_stands_for_any_characters() {
@@ -83,7 +84,7 @@ mod tests {
 
     #[test]
     fn patterns_that_match_nothing_or_leave_nothing_are_refused() {
-        let (_, params) = MonoVit::new(Preset::Pico.config(), 0);
+        let (_, params) = DepthNetwork::new(Preset::Pico.config(), 0);
         let refused = |pattern: &str| frozen(&params, &[pattern.to_owned()]).unwrap_err().to_string();
         let error = refused("encodre.*");
         assert!(

@@ -7,6 +7,7 @@ use super::recipes;
 use crate::error::{Error, Result};
 use crate::formats::bounded::{MAX_SETTINGS, read_text};
 use crate::monovit::Preset;
+use crate::networks::{Architecture, EncoderKind, Network};
 
 /// Settings of a recipe and a file, still without the defaults.
 #[derive(Debug, Default)]
@@ -48,7 +49,27 @@ impl Layers {
     /// # Errors
     /// If there is no preset of that name.
     pub fn preset(&self) -> Result<Option<Preset>> {
-        self.said.get("preset").cloned().map(|preset| preset.try_into().map_err(|e| self.wrong(&e))).transpose()
+        self.named("preset")
+    }
+
+    /// The network that is named, if any is.
+    ///
+    /// # Errors
+    /// If there is no network of that name.
+    pub fn network(&self) -> Result<Option<Network>> {
+        self.named("network")
+    }
+
+    /// The encoder that is named, if any is.
+    ///
+    /// # Errors
+    /// If there is no encoder of that name.
+    pub fn encoder(&self) -> Result<Option<EncoderKind>> {
+        self.named("encoder")
+    }
+
+    fn named<T: serde::de::DeserializeOwned>(&self, field: &str) -> Result<Option<T>> {
+        self.said.get(field).cloned().map(|name| name.try_into().map_err(|e| self.wrong(&e))).transpose()
     }
 
     /// These layers over defaults.
@@ -90,7 +111,8 @@ impl Layers {
 pub fn read_config(path: &Path) -> Result<RunConfig> {
     let layers = Layers::read(None, Some(path))?;
     let preset = layers.preset()?.unwrap_or(Preset::Nano);
-    layers.over(&RunConfig::new(preset, STEPS))
+    let architecture = Architecture::of(layers.network()?.unwrap_or_default(), preset);
+    layers.over(&RunConfig::new(architecture, STEPS))
 }
 
 /// Puts what was said over the defaults, table by table. A choice (`kind`) with what belongs to it is one thing.

@@ -15,8 +15,9 @@ use crate::data::camera::Camera;
 use crate::data::stereo::{Baseline, Sources};
 use crate::error::{Error, Result};
 use crate::monovit::loss::LossConfig;
-use crate::monovit::setup::check_size;
-use crate::monovit::{Ablation, Config, Preset, Setup};
+use crate::monovit::{Ablation, Preset};
+use crate::networks::setup::check_size;
+use crate::networks::{Architecture, Config, EncoderKind, Network, Setup};
 use crate::optim::Schedule;
 
 /// Number of steps of the default run.
@@ -129,6 +130,12 @@ pub struct Plan {
 pub struct RunConfig {
     /// Named size of the networks.
     pub preset: Preset,
+    /// The network, which means its decoder.
+    #[serde(default)]
+    pub network: Network,
+    /// The depth encoder; without, the one that the network comes with.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub encoder: Option<EncoderKind>,
     /// Height of the pictures that the networks see, a multiple of 32.
     pub height: usize,
     /// Width of the pictures that the networks see, a multiple of 32.
@@ -181,7 +188,7 @@ pub struct RunConfig {
     /// Weights to start from: files or folders, all four networks together; `shipped` means those inside the program.
     #[serde(default, deserialize_with = "none_one_or_many", skip_serializing_if = "Vec::is_empty")]
     pub init: Vec<PathBuf>,
-    /// Weights that the depth encoder starts from alone: an MPViT trained on ImageNet.
+    /// Weights that the depth encoder starts from alone: an MPViT or a ResNet, as the encoder is, trained on ImageNet.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub init_encoder: Option<PathBuf>,
     /// Weights that the pose encoder starts from alone: a ResNet-18 trained on ImageNet.
@@ -245,10 +252,14 @@ impl RunConfig {
         Self::new(Preset::Nano, STEPS)
     }
 
-    /// The recipe for a small network from scratch, on the embedded street.
-    pub fn new(preset: Preset, steps: u64) -> Self {
+    /// The recipe for a small network from scratch, on the embedded street: of an architecture or, given a preset, of MonoViT
+    /// in that size.
+    pub fn new(architecture: impl Into<Architecture>, steps: u64) -> Self {
+        let Architecture { network, encoder, preset } = architecture.into();
         RunConfig {
             preset,
+            network,
+            encoder: (encoder != network.usual_encoder()).then_some(encoder),
             height: 96,
             width: 320,
             batch: 4,
@@ -307,8 +318,8 @@ impl RunConfig {
     /// times as far between two frames, depths of three times the distance explain the new pictures, and depth gets there
     /// long before a pose network does whose output is scaled by 0.01.
     pub fn from_weights(setup: Setup, steps: u64) -> Self {
-        let Setup { preset, ablation, height, width, min_depth, max_depth } = setup;
-        let scratch = Self::new(preset, steps);
+        let Setup { preset, ablation, height, width, min_depth, max_depth, .. } = setup;
+        let scratch = Self::new(setup.architecture(), steps);
         let reduced = matches!(preset, Preset::Pico | Preset::Nano);
         RunConfig {
             ablation,
@@ -328,20 +339,31 @@ impl RunConfig {
     }
 
     /// The recipe for a depth encoder that starts from an image classifier: the published learning rates.
-    pub fn from_encoder(preset: Preset, steps: u64) -> Self {
-        let scratch = Self::new(preset, steps);
+    pub fn from_encoder(architecture: impl Into<Architecture>, steps: u64) -> Self {
+        let scratch = Self::new(architecture, steps);
         let optim = OptimConfig { encoder_rate: 5e-5, rate: 1e-4, pose_rate: 1e-4, ..scratch.optim };
         RunConfig { optim, ..scratch }
     }
 
+    /// The names of the networks.
+    pub fn architecture(&self) -> Architecture {
+        let encoder = self.encoder.unwrap_or(self.network.usual_encoder());
+        Architecture { network: self.network, encoder, preset: self.preset }
+    }
+
     /// The networks, their pictures and the range of their depths.
     pub fn setup(&self) -> Setup {
-        let RunConfig { preset, ablation, height, width, .. } = *self;
+        let Architecture { network, encoder, preset } = self.architecture();
+        let RunConfig { ablation, height, width, .. } = *self;
         let (min_depth, max_depth) = (self.loss.min_depth, self.loss.max_depth);
-        Setup { preset, ablation, height, width, min_depth, max_depth }
+        Setup { preset, network, encoder, ablation, height, width, min_depth, max_depth }
     }
 
     /// The sizes of the networks.
+    ///
+    /// # Panics
+    /// If [`check`](RunConfig::check) refuses them.
+    #[track_caller]
     pub fn model(&self) -> Config {
         self.setup().model()
     }
@@ -424,7 +446,7 @@ impl RunConfig {
         self.loss.check()?;
         self.rotations.check()?;
         self.optim.check()?;
-        self.ablation.check(&self.preset.config())
+        self.architecture().config(&self.ablation).map(drop)
     }
 }
 

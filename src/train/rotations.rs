@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use super::freeze::Frozen;
 use super::recipe::steps_of;
 use crate::data::batch::Batch;
-use crate::monovit::MonoVit;
+use crate::networks::DepthNetwork;
 use crate::nn::{Context, Params};
 use crate::optim::{AdamW, Decay, Group, Schedule};
 use crate::random::{Random, Stream};
@@ -79,7 +79,7 @@ impl RotationPlan {
     pub(super) fn term(
         &self,
         [step, pass]: [u64; 2],
-        model: &MonoVit,
+        model: &DepthNetwork,
         c: &Context<f32>,
         batch: &Batch,
         seed: u64,
@@ -110,7 +110,7 @@ impl Lesson {
     }
 
     /// One step; the mean error in pixels before it.
-    pub fn step(&mut self, model: &MonoVit, params: &mut Params<f32>, batch: &Batch) -> f64 {
+    pub fn step(&mut self, model: &DepthNetwork, params: &mut Params<f32>, batch: &Batch) -> f64 {
         let step = self.adamw.steps;
         let tape = Tape::new();
         let mut random = Random::of(self.seed, Stream::Rotations(step));
@@ -135,7 +135,13 @@ const ROLL: f64 = 0.25;
 ///
 /// # Panics
 /// If the batch holds none.
-pub fn rotation_error(model: &MonoVit, c: &Context<f32>, batch: &Batch, pixels: f64, random: &mut Random) -> Var<f32> {
+pub fn rotation_error(
+    model: &DepthNetwork,
+    c: &Context<f32>,
+    batch: &Batch,
+    pixels: f64,
+    random: &mut Random,
+) -> Var<f32> {
     let (target, neighbours) = (&batch.target, batch.neighbours.as_ref());
     let [prev, next] = neighbours.expect("frames that follow one another");
     let mut turned = |frames: &Tensor<f32>| turn(frames, &angles(&batch.intrinsics, pixels, random), &batch.intrinsics);
@@ -214,7 +220,7 @@ mod tests {
         let street = Street::render(&config, None);
         let batch =
             batch_of_step(&street, Augment { flip: false, jitter: false, sensor: false }, 2, 0, 0).expect("a batch");
-        let (model, mut params) = MonoVit::new(Preset::Pico.config(), 0);
+        let (model, mut params) = DepthNetwork::new(Preset::Pico.config(), 0);
         // A network that answers with no motion is wrong by the angles themselves.
         for name in ["pose.net.3.weight", "pose.net.3.bias"] {
             let id = params.find(name).expect("the last layer");

@@ -27,7 +27,7 @@ use crate::data::batch::{Batch, Loader, SkipList};
 use crate::error::{Error, Result};
 use crate::formats::atomic::{self, check_writable, write_bytes_atomically};
 use crate::formats::safetensors;
-use crate::monovit::{MonoVit, Setup};
+use crate::networks::{DepthNetwork, Setup};
 use crate::nn::Params;
 use crate::weights::{self, Need, Weights};
 
@@ -390,7 +390,7 @@ pub fn write_weights(path: &Path, params: &Params<f32>, setup: &Setup) -> Result
 }
 
 /// Reads weights to predict depth with: a run's folder, or a file or folder of any kind that [`weights::load`] reads.
-pub fn load_weights(path: &Path) -> Result<(MonoVit, Params<f32>, Setup)> {
+pub fn load_weights(path: &Path) -> Result<(DepthNetwork, Params<f32>, Setup)> {
     let Weights { model, params, setup, .. } = weights::load(&[path.to_owned()], Need::Depth, false)?;
     Ok((model, params, setup))
 }

@@ -10,9 +10,8 @@ use super::rotations::Lesson;
 use super::vitals::{Signs, Vitals};
 use crate::data::batch::Batch;
 use crate::error::{Error, Result};
-use crate::monovit::MonoVit;
-use crate::monovit::config::Config;
 use crate::monovit::loss::{Loss, LossConfig, Scales, TieBreak, Views, loss};
+use crate::networks::{Config, DepthNetwork};
 use crate::nn::{Context, Param, ParamId, Params};
 use crate::optim::{AdamW, Average, Group, add, clip_from, norms, scale};
 use crate::random::{Random, Stream};
@@ -79,7 +78,7 @@ impl StepReport {
 /// A model in training.
 pub struct Trainer {
     /// The networks.
-    pub model: MonoVit,
+    pub model: DepthNetwork,
     /// Their parameters.
     pub params: Params<f32>,
     plan: Plan,
@@ -138,7 +137,7 @@ fn views(batch: &Batch, scales: Scales) -> Views<f32> {
 
 /// Transforms of points from the targets' cameras to those of their sources, `[B, 3, 4]` each: what the pose network sees in
 /// neighbours, what is known of a second camera.
-pub(super) fn transforms(model: &MonoVit, c: &Context<f32>, batch: &Batch, target: &Var<f32>) -> Vec<Var<f32>> {
+pub(super) fn transforms(model: &DepthNetwork, c: &Context<f32>, batch: &Batch, target: &Var<f32>) -> Vec<Var<f32>> {
     let in_time = batch.neighbours.as_ref().map(|neighbours| {
         let [prev, next] = neighbours.each_ref().map(|t| Var::constant(t.clone()));
         model.transforms(c, &prev, target, &next)
@@ -148,13 +147,13 @@ pub(super) fn transforms(model: &MonoVit, c: &Context<f32>, batch: &Batch, targe
 
 impl Trainer {
     /// A model at its start.
-    pub fn new(config: Config, plan: Plan) -> Self {
-        let (model, params) = MonoVit::new(config, plan.seed);
+    pub fn new(config: impl Into<Config>, plan: Plan) -> Self {
+        let (model, params) = DepthNetwork::new(config, plan.seed);
         Self::of(model, params, plan)
     }
 
     /// A model with the given weights.
-    pub fn of(model: MonoVit, params: Params<f32>, plan: Plan) -> Self {
+    pub fn of(model: DepthNetwork, params: Params<f32>, plan: Plan) -> Self {
         let mut adamw = AdamW::new(&params);
         adamw.betas = plan.optim.betas;
         let average = (plan.optim.average > 0.0).then(|| Average::new(&params, plan.optim.average));

@@ -22,7 +22,7 @@ use crate::error::Result;
 use crate::eval::metrics::Report;
 use crate::eval::predictor::Predictor;
 use crate::monovit::loss::{Reprojection, photometric};
-use crate::monovit::{MonoVit, Setup};
+use crate::networks::{DepthNetwork, Setup};
 use crate::nn::{Context, Params};
 use crate::report::map::{UNKNOWN, draw_map};
 use crate::tensor::{Tensor, Var, profile};
@@ -76,7 +76,7 @@ pub struct View {
 
 /// Weights and data to show.
 pub(super) struct Shown<'a> {
-    pub model: &'a MonoVit,
+    pub model: &'a DepthNetwork,
     pub params: &'a Params<f32>,
     pub setup: Setup,
     pub data: &'a dyn DataSource,

@@ -1,22 +1,42 @@
-//! Starts from networks that were trained to classify pictures (ImageNet), as the paper's are.
+//! Starts from networks that were trained to classify pictures (ImageNet), as the papers' are.
 
 use std::path::Path;
 
+use super::sizes::{Family, Sizes};
 use super::{Need, Sources};
 use crate::error::{Error, Result};
 use crate::formats::StoredTensor;
-use crate::monovit::{Config, Preset};
+use crate::monovit::Ablation;
+use crate::networks::{Architecture, Config};
 use crate::nn::{Named, Params, Report};
 
 /// The first convolution of the pose encoder.
 const FIRST: &str = "pose_encoder.encoder.conv1.weight";
 
-/// Starts the depth encoder from an MPViT (or from the encoder of a MonoViT); a classification head is passed over.
+/// Starts the depth encoder of an architecture from weights of its kind: an MPViT, or a ResNet in torchvision's names (or the
+/// encoder of trained weights). A classification head is passed over.
 ///
 /// # Errors
-/// As [`Sources::open`] and [`Sources::fill`]; if it is an MPViT of another size, unless `allow_partial`.
-pub fn start_encoder(params: &mut Params<f32>, preset: Preset, path: &Path, allow_partial: bool) -> Result<Report> {
-    start(params, preset, path, "encoder", allow_partial)
+/// As [`Sources::open`] and [`Sources::fill`]; if it is another encoder, or of another size, unless `allow_partial`.
+pub fn start_encoder(
+    params: &mut Params<f32>,
+    architecture: impl Into<Architecture>,
+    path: &Path,
+    allow_partial: bool,
+) -> Result<Report> {
+    let architecture = architecture.into();
+    let sources = Sources::open(&[path.to_owned()])?;
+    let own = sources.only("encoder");
+    let config = architecture.config(&Ablation::default())?;
+    let (wanted, found) = (Family::of(&config.encoder), Sizes::of(&own.tensors).family());
+    if found != Some(wanted) {
+        let found = found.map_or(String::new(), |family| format!(", but those of {}", family.described()));
+        return Err(Error::file(path, format!("holds no tensors of {}{found}", wanted.described())));
+    }
+    if !allow_partial {
+        own.expect(architecture)?;
+    }
+    sources.fill(params, Need::Only("encoder"), allow_partial)
 }
 
 /// Starts the pose encoder from a ResNet-18 in torchvision's names (or from a pose encoder).
@@ -28,43 +48,40 @@ pub fn start_encoder(params: &mut Params<f32>, preset: Preset, path: &Path, allo
 /// As [`start_encoder`].
 pub fn start_pose_encoder(
     params: &mut Params<f32>,
-    preset: Preset,
+    architecture: impl Into<Architecture>,
     path: &Path,
     allow_partial: bool,
 ) -> Result<Report> {
-    start(params, preset, path, "pose_encoder", allow_partial)
-}
-
-fn start(
-    params: &mut Params<f32>,
-    preset: Preset,
-    path: &Path,
-    network: &'static str,
-    allow_partial: bool,
-) -> Result<Report> {
+    let architecture = architecture.into();
+    let config = architecture.config(&Ablation::default())?;
     let mut sources = Sources::open(&[path.to_owned()])?;
-    let prefix = format!("{network}.");
-    if !sources.tensors.iter().any(|t| t.name.starts_with(&prefix)) {
-        let what =
-            if network == "encoder" { "an MPViT (stem., mhca_stages.)" } else { "a ResNet-18 (conv1., layer1.)" };
-        return Err(Error::file(path, format!("holds no tensors of {what}")));
+    if !sources.networks().contains(&"pose_encoder") {
+        // A ResNet for one picture, which a depth encoder may be as well.
+        for tensor in &mut sources.tensors {
+            if tensor.name.starts_with("encoder.encoder.") {
+                tensor.name.insert_str(0, "pose_");
+            }
+        }
+    }
+    if !sources.networks().contains(&"pose_encoder") {
+        return Err(Error::file(path, "holds no tensors of a ResNet-18 (conv1., layer1.)"));
     }
     for tensor in &mut sources.tensors {
         if tensor.name == FIRST {
-            for_two_pictures(tensor, &preset.config());
+            for_two_pictures(tensor, &config);
         }
     }
     if !allow_partial {
-        sources.only(network).expect(preset)?;
+        sources.only("pose_encoder").expect(architecture)?;
     }
-    sources.fill(params, Need::Only(network), allow_partial)
+    sources.fill(params, Need::Only("pose_encoder"), allow_partial)
 }
 
 /// `[w, 3, 7, 7]` over one picture to `[w, 6, 7, 7]` over two.
 fn for_two_pictures(first: &mut Named, config: &Config) {
     let &[out, 3, height, width] = first.tensor.shape() else { return };
     // Anything else is refused by its shape or kind of number later on.
-    if out != config.pose_width {
+    if out != config.pose.width {
         return;
     }
     let Some(numbers) = first.tensor.to_f64() else { return };

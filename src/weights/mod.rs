@@ -5,13 +5,13 @@
 //!
 //! // A folder with encoder.pth and depth.pth, one file with all, or a run of this program.
 //! let weights = load(&["mono_640x192".into()], Need::Depth, false)?;
-//! println!("{} at {} x {}", weights.setup.preset.name(), weights.setup.width, weights.setup.height);
+//! println!("{} at {} x {}", weights.setup.architecture().name(), weights.setup.width, weights.setup.height);
 //! println!("{}", weights.report);
 //! # Ok::<(), parallax::Error>(())
 //! ```
 //!
-//! [`Sources`] opens the files and finds out what each tensor is (`names.rs`) and which size of the network they belong
-//! to (`sizes.rs`). Loading is strict: every tensor of a network that is there, and no other, each finite, and the same
+//! [`Sources`] opens the files and finds out what each tensor is (`names.rs`) and which networks, of which size, they
+//! belong to (`sizes.rs`). Loading is strict: every tensor of a network that is there, and no other, each finite, and the same
 //! under all its names. [`start_encoder`] and [`start_pose_encoder`] take networks that were trained on ImageNet.
 //! [`save`] writes any of these forms. The path [`SHIPPED`] stands for the weights inside the program.
 
@@ -31,14 +31,15 @@ pub use sources::{Need, Sources};
 use std::path::PathBuf;
 
 use crate::error::Result;
-use crate::monovit::{Ablation, MonoVit, Preset, Setup};
+use crate::monovit::Ablation;
+use crate::networks::{Architecture, DepthNetwork, Setup};
 use crate::nn::{Params, Report};
 use crate::tensor::bf16_bits;
 
 /// A model with weights from files.
 pub struct Weights {
     /// The networks.
-    pub model: MonoVit,
+    pub model: DepthNetwork,
     /// Their parameters. Those that were not loaded are as a new model's.
     pub params: Params<f32>,
     /// The size of the networks and of their pictures, the range of depths.
@@ -75,11 +76,11 @@ pub fn load(paths: &[PathBuf], need: Need, allow_partial: bool) -> Result<Weight
 /// As [`load`].
 pub fn load_from(sources: &Sources, need: Need, allow_partial: bool) -> Result<Weights> {
     let setup = sources.setup(need)?;
-    // Of a network that is not wholly a preset, tensor by tensor will do.
+    // Of a network that parts are taken away from, tensor by tensor will do.
     if !allow_partial && setup.ablation == Ablation::default() {
-        sources.expect(setup.preset)?;
+        sources.expect(setup.architecture())?;
     }
-    let (model, mut params) = MonoVit::new(setup.model(), 0);
+    let (model, mut params) = DepthNetwork::new(setup.model(), 0);
     let report = sources.fill(&mut params, need, allow_partial)?;
     Ok(Weights { model, params, setup, report, origin: sources.origin().cloned() })
 }
@@ -92,10 +93,10 @@ pub fn setup_of(paths: &[PathBuf]) -> Result<Setup> {
     Sources::open(paths)?.setup(Need::All)
 }
 
-/// The size of the network that some files are weights of.
+/// The networks that some files are weights of.
 ///
 /// # Errors
-/// As [`Sources::open`] and [`Sources::preset`].
-pub fn preset_of(paths: &[PathBuf]) -> Result<Preset> {
-    Sources::open(paths)?.preset(Need::All)
+/// As [`Sources::open`] and [`Sources::architecture`].
+pub fn architecture_of(paths: &[PathBuf]) -> Result<Architecture> {
+    Sources::open(paths)?.architecture(Need::All)
 }

@@ -4,9 +4,11 @@
 //! `encoder.conv1.weight`, `net.0.weight`), or as one file with the networks' names in front, and either may be wrapped
 //! once more by what trained it (`module.`, `model.`, `state_dict.`).
 
+use std::path::Path;
 use std::sync::LazyLock;
 
-use crate::monovit::{MonoVit, Preset};
+use crate::monovit::Preset;
+use crate::networks::DepthNetwork;
 use crate::nn::Params;
 
 /// The four networks, as the model's names begin.
@@ -33,6 +35,8 @@ const TRAINING: [&str; 8] = [
 pub(super) enum Place {
     /// A parameter, if there is one of this name.
     Model(String),
+    /// A ResNet's, of the name that torchvision gives it: the depth encoder's or the pose encoder's.
+    ResNet(String),
     /// Something that no model here has a use for: what, in the plural.
     Useless(&'static str),
     /// Something unknown.
@@ -103,6 +107,9 @@ pub(super) fn place(name: &str) -> Place {
     if TRAINING.iter().any(|part| name.starts_with(part)) {
         return Place::Useless("tensors of a training's state");
     }
+    if let Some(rest) = resnet(name) {
+        return Place::ResNet(rest.to_owned());
+    }
     if let Some((network, rest)) = own(name) {
         return Place::Model(format!("{network}.{rest}"));
     }
@@ -117,8 +124,11 @@ pub(super) fn place(name: &str) -> Place {
     };
     let is_encoder = networks.iter().any(|n| n.ends_with("encoder"));
     let head = |name: &str| name.starts_with("cls_head.") || name.starts_with("fc.");
-    if head(name) || is_encoder && head(inner) || root == "pose_encoder" && inner.starts_with("encoder.fc.") {
+    if head(name) || is_encoder && head(inner.strip_prefix("encoder.").unwrap_or(inner)) {
         return Place::Useless("tensors of a classification head");
+    }
+    if let (true, Some(rest)) = (is_encoder, resnet(inner)) {
+        return Place::Model(format!("{root}.encoder.{rest}"));
     }
     match own(inner) {
         Some((network, rest)) if networks.contains(&network) => Place::Model(format!("{network}.{rest}")),
@@ -132,28 +142,51 @@ fn own(name: &str) -> Option<(&'static str, String)> {
     match first {
         "stem" | "patch_embed_stages" | "mhca_stages" => Some(("encoder", name.to_owned())),
         "convs" => Some(("depth", name.to_owned())),
-        // The same modules once more, numbered.
+        // Monodepth2's, which has no other names; of MonoViT's the same modules once more.
         "decoder" => {
             let (number, rest) = rest.split_once('.')?;
-            let key = DECODER_KEYS.get(number.parse::<usize>().ok()?)?;
-            Some(("depth", format!("convs.{key}.{rest}")))
+            let number = number.parse::<usize>().ok()?;
+            match number < UNET_MODULES && rest.starts_with("conv.") {
+                true => Some(("depth", format!("decoder.{number}.{rest}"))),
+                false => Some(("depth", format!("convs.{}.{rest}", DECODER_KEYS.get(number)?))),
+            }
         }
         "net" if rest.starts_with(|c: char| c.is_ascii_digit()) => Some(("pose", name.to_owned())),
-        "conv1" | "bn1" | "layer1" | "layer2" | "layer3" | "layer4" => {
-            Some(("pose_encoder", format!("encoder.{name}")))
-        }
-        // (Not again and again.)
-        "encoder" if !rest.starts_with("encoder.") && matches!(own(rest), Some(("pose_encoder", _))) => {
-            Some(("pose_encoder", name.to_owned()))
-        }
         _ => None,
     }
 }
 
-/// The decoder's modules in the order of the public checkpoints.
+/// A ResNet's name of a tensor, from torchvision's, or with `encoder.` in front.
+fn resnet(name: &str) -> Option<&str> {
+    let name = name.strip_prefix("encoder.").unwrap_or(name);
+    let (first, _) = name.split_once('.')?;
+    matches!(first, "conv1" | "bn1" | "layer1" | "layer2" | "layer3" | "layer4").then_some(name)
+}
+
+/// Number of modules of Monodepth2's decoder.
+const UNET_MODULES: usize = 14;
+
+/// The nested decoder's name of a tensor that is called by its number, `depth.decoder.N.`, as Monodepth2's is.
+pub(super) fn nested(name: &str) -> Option<String> {
+    let (number, rest) = name.strip_prefix("depth.decoder.")?.split_once('.')?;
+    Some(format!("depth.convs.{}.{rest}", DECODER_KEYS.get(number.parse::<usize>().ok()?)?))
+}
+
+/// The network that a ResNet of a file is: the depth encoder if it sees one picture, the pose encoder if two. Where the first
+/// convolution is missing, the file's name has the say.
+pub(super) fn resnet_network(path: &Path, first: Option<&[usize]>) -> &'static str {
+    match first {
+        Some([_, 3, ..]) => "encoder",
+        Some(_) => "pose_encoder",
+        None if path.file_stem().is_some_and(|stem| stem == "encoder") => "encoder",
+        None => "pose_encoder",
+    }
+}
+
+/// The nested decoder's modules in the order of the public checkpoints.
 pub(super) static DECODER_KEYS: LazyLock<Vec<String>> = LazyLock::new(|| {
     // They are the same for every size.
-    let (_, params): (_, Params<f32>) = MonoVit::new(Preset::Pico.config(), 0);
+    let (_, params): (_, Params<f32>) = DepthNetwork::new(Preset::Pico.config(), 0);
     let names = params.iter().filter_map(|(_, p)| p.name().strip_prefix("depth.convs.")?.split('.').next());
     let mut keys: Vec<String> = Vec::new();
     for key in names {
@@ -197,20 +230,31 @@ mod tests {
             ("module.decoder.decoder.36.conv.bias", "depth.convs.dispconv3.conv.bias"),
             ("depth.decoder.1.conv_se.bias", "depth.convs.f3.conv_se.bias"),
             ("depth.convs.f4.conv_se.bias", "depth.convs.f4.conv_se.bias"),
-            ("encoder.conv1.weight", "pose_encoder.encoder.conv1.weight"),
-            ("encoder.layer4.1.bn2.bias", "pose_encoder.encoder.layer4.1.bn2.bias"),
+            ("encoder.encoder.conv1.weight", "encoder.encoder.conv1.weight"),
+            ("module.encoder.encoder.layer3.5.bn3.bias", "encoder.encoder.layer3.5.bn3.bias"),
+            ("decoder.0.conv.conv.weight", "depth.decoder.0.conv.conv.weight"),
+            ("depth.decoder.13.conv.bias", "depth.decoder.13.conv.bias"),
             ("pose_encoder.encoder.bn1.bias", "pose_encoder.encoder.bn1.bias"),
-            ("conv1.weight", "pose_encoder.encoder.conv1.weight"),
             ("net.3.bias", "pose.net.3.bias"),
             ("pose.net.3.bias", "pose.net.3.bias"),
         ];
         for (theirs, ours) in cases {
             assert_eq!(place(theirs), Place::Model(ours.into()), "{theirs}");
         }
+        for (theirs, ours) in [
+            ("conv1.weight", "conv1.weight"),
+            ("encoder.conv1.weight", "conv1.weight"),
+            ("module.encoder.layer4.1.bn2.bias", "layer4.1.bn2.bias"),
+        ] {
+            assert_eq!(place(theirs), Place::ResNet(ours.into()), "{theirs}");
+        }
+        assert_eq!(nested("depth.decoder.4.conv.conv.bias").as_deref(), Some("depth.convs.X_00_Conv_0.conv.conv.bias"));
+        assert_eq!(nested("depth.decoder.40.conv.bias"), None);
         let useless = [
             "fc.weight",
             "encoder.fc.bias",
             "pose_encoder.encoder.fc.bias",
+            "encoder.encoder.fc.bias",
             "cls_head.cls.weight",
             "model.stem.0.bn.num_batches_tracked",
             "optimizer.state.0.exp_avg",

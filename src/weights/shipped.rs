@@ -176,7 +176,7 @@ pub fn ship(weights: &Weights, origin: &Origin, path: &Path) -> Result<()> {
     if bytes > MOST_BYTES {
         let message = format!(
             "{} has {:.1} MB of numbers in bfloat16: at most {:.1} are shipped (nano fits)",
-            weights.setup.preset.name(),
+            weights.setup.architecture().name(),
             bytes as f64 / 1e6,
             MOST_BYTES as f64 / 1e6
         );

@@ -3,14 +3,15 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use super::names::{NETWORKS, Place, place, unwrapped, wrappers};
+use super::names::{NETWORKS, Place, nested, place, resnet_network, unwrapped, wrappers};
 use super::shipped::{self, Origin, SHIPPED};
 use super::sizes::Sizes;
 use crate::error::{Error, Result};
 use crate::formats::TensorFile;
 use crate::formats::pth::shown;
-use crate::monovit::setup::check_size;
-use crate::monovit::{Preset, Setup};
+use crate::monovit::Ablation;
+use crate::networks::setup::check_size;
+use crate::networks::{Architecture, Setup};
 use crate::nn::{Named, Params, Report, Skipped, fit};
 
 /// Which of the four networks have to be there. One that is there at all has to be there whole.
@@ -100,10 +101,17 @@ impl Sources {
         let wrappers: Vec<String> = wrappers(&unknown).into_iter().map(str::to_owned).collect();
         // The tensors of the networks, plain and averaged.
         let mut both: [Vec<Named>; 2] = [Vec::new(), Vec::new()];
+        let placed = |origin: &str| match place(origin) {
+            Place::Unknown => wrappers.iter().find_map(|w| origin.strip_prefix(w.as_str())).map(place),
+            known => Some(known),
+        };
+        let first = Some(Place::ResNet("conv1.weight".into()));
+        let first = file.tensors.iter().find(|(origin, _)| placed(origin) == first);
+        let resnet = resnet_network(&path, first.map(|(_, tensor)| tensor.shape()));
         for (origin, tensor) in file.tensors {
-            let known = match place(&origin) {
-                Place::Unknown => wrappers.iter().find_map(|w| origin.strip_prefix(w.as_str())).map(place),
-                known => Some(known),
+            let known = match placed(&origin) {
+                Some(Place::ResNet(name)) => Some(Place::Model(format!("{resnet}.encoder.{name}"))),
+                known => known,
             };
             match known {
                 Some(Place::Model(name)) => {
@@ -111,7 +119,13 @@ impl Sources {
                     both[of].push(Named { name, origin, file: path.clone(), tensor });
                 }
                 Some(Place::Useless(what)) => self.skipped.push(Skipped { name: shown(&origin), what }),
-                Some(Place::Unknown) | None => self.unexpected.push(shown(&origin)),
+                Some(Place::Unknown | Place::ResNet(_)) | None => self.unexpected.push(shown(&origin)),
+            }
+        }
+        // Modules of the nested decoder stand under their numbers once more, which alone would mean Monodepth2's.
+        if both.iter().flatten().any(|t| t.name.starts_with("depth.convs.")) {
+            for tensor in both.iter_mut().flatten() {
+                tensor.name = nested(&tensor.name).unwrap_or_else(|| std::mem::take(&mut tensor.name));
             }
         }
         let [plain, average] = both;
@@ -169,12 +183,12 @@ impl Sources {
         Error::file(self.all_paths(), message)
     }
 
-    /// The preset that the tensors' shapes are those of.
+    /// The networks that the tensors' names and shapes are those of.
     ///
     /// # Errors
     /// If there is none: names the nearest one and what differs. If there are several, because there are too few tensors
     /// to tell them apart, unless `need` is [`Need::Any`].
-    pub fn preset(&self, need: Need) -> Result<Preset> {
+    pub fn architecture(&self, need: Need) -> Result<Architecture> {
         let sizes = self.some_sizes()?;
         match sizes.fitting()[..] {
             [one] => Ok(one),
@@ -189,7 +203,7 @@ impl Sources {
                 Err(self.error(message))
             }
             ref several => {
-                let names: Vec<&str> = several.iter().map(|p| p.name()).collect();
+                let names: Vec<String> = several.iter().map(|a| a.name()).collect();
                 let message = format!("could be of the sizes {} alike: the depth encoder is missing", names.join(", "));
                 Err(self.error(message))
             }
@@ -201,28 +215,29 @@ impl Sources {
         if sizes.is_empty() {
             let example = self.unexpected.first().map_or(String::new(), |n| format!(", such as {n}"));
             let others = self.unexpected.len() + self.skipped.len();
-            let message = format!("holds none of MonoViT's weights, but {others} other tensors{example}");
+            let message = format!("holds no weights of a network of this program, but {others} other tensors{example}");
             return Err(self.error(message));
         }
         Ok(sizes)
     }
 
-    /// Makes sure that the tensors are of this size.
+    /// Makes sure that the tensors are of this architecture (or, given a preset, of MonoViT in that size).
     ///
     /// # Errors
-    /// Says what differs, and which preset they are of.
-    pub fn expect(&self, preset: Preset) -> Result<()> {
+    /// Says what differs, and which networks they are of.
+    pub fn expect(&self, architecture: impl Into<Architecture>) -> Result<()> {
+        let architecture = architecture.into();
         let sizes = self.some_sizes()?;
-        let (differences, _) = sizes.differences(&preset.config());
+        let (differences, _) = sizes.differences(&architecture.config(&Ablation::default())?);
         if differences.is_empty() {
             return Ok(());
         }
         let advice = match sizes.fitting()[..] {
-            [one] => format!("; they are of the preset {}", one.name()),
+            [one] => format!("; they are of {}", one.in_words()),
             _ => String::new(),
         };
         let message =
-            format!("does not fit the preset {}: these weights have {}{advice}", preset.name(), differences.join(", "));
+            format!("does not fit {}: these weights have {}{advice}", architecture.in_words(), differences.join(", "));
         Err(self.error(message))
     }
 
@@ -230,12 +245,12 @@ impl Sources {
     /// their size, for pictures of the size that an encoder's file says.
     ///
     /// # Errors
-    /// As [`Sources::preset`].
+    /// As [`Sources::architecture`].
     pub fn setup(&self, need: Need) -> Result<Setup> {
         if let Some(setup) = self.setup {
             return Ok(setup);
         }
-        let usual = Setup::of(self.preset(need)?);
+        let usual = Setup::of(self.architecture(need)?);
         let [height, width] = self.size;
         Ok(Setup { height: height.unwrap_or(usual.height), width: width.unwrap_or(usual.width), ..usual })
     }

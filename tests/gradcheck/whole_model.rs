@@ -1,15 +1,16 @@
 //! The whole of a small MonoViT and its loss, in f64: by the slope of the Taylor remainder along random directions.
 
 use parallax::data::batch::{Augment, Batch, Making, batch_of_step};
+use parallax::monovit::Preset;
 use parallax::monovit::loss::{LossConfig, Views, loss};
-use parallax::monovit::{Config, MonoVit, Preset};
+use parallax::networks::{Config, DepthNetwork};
 use parallax::nn::{Context, Params};
 use parallax::random::Random;
 use parallax::street::{Street, StreetConfig};
 use parallax::tensor::{Tape, Tensor, Var};
 
 fn total(
-    model: &MonoVit,
+    model: &DepthNetwork,
     params: &Params<f64>,
     tape: &Tape<f64>,
     batch: &Batch,
@@ -64,13 +65,13 @@ fn supervision_by_known_depth_has_the_gradient_of_its_value() {
 }
 
 /// The slope along random directions of the parameters under each prefix: near 2, and near 1 with a wrong gradient.
-pub fn assert_taylor(sizes: Config, loss: &LossConfig, prefixes: &[&str]) {
+pub fn assert_taylor(sizes: impl Into<Config>, loss: &LossConfig, prefixes: &[&str]) {
     let config = StreetConfig { height: 64, width: 96, sequences: 1, frames: 5, ..StreetConfig::default() };
     let street = Street::render(&config, None);
     let plain = Augment { flip: false, jitter: false, sensor: false };
     let making = Making { depth: loss.depth_supervision > 0.0, ..Making::from(plain) };
     let batch = batch_of_step(&street, making, 1, 0, 0).expect("a batch");
-    let (model, params) = MonoVit::new::<f64>(sizes, 3);
+    let (model, params) = DepthNetwork::new::<f64>(sizes, 3);
     let tape = Tape::new();
     let (c, found) = total(&model, &params, &tape, &batch, loss);
     let gradients = c.gradients(&mut found.backward());

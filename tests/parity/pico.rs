@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use parallax::formats::{TensorFile, safetensors};
+use parallax::monovit::Preset;
 use parallax::monovit::loss::{Loss, LossConfig, Views, loss};
-use parallax::monovit::{MonoVit, Preset};
+use parallax::networks::DepthNetwork;
 use parallax::nn::{Context, Folded, Named, Params, fit};
 use parallax::optim::{AdamW, Group};
 use parallax::random::Random;
@@ -37,7 +38,7 @@ impl<T: Float> Reference<T> {
 }
 
 struct Pico<T: Float> {
-    model: MonoVit,
+    model: DepthNetwork,
     params: Params<T>,
     reference: Reference<T>,
 }
@@ -45,7 +46,7 @@ struct Pico<T: Float> {
 impl<T: Float> Pico<T> {
     fn load() -> Self {
         let reference = Reference::read();
-        let (model, mut params) = MonoVit::new(Preset::Pico.config(), 0);
+        let (model, mut params) = DepthNetwork::new(Preset::Pico.config(), 0);
         let file = TensorFile::open(&fixture()).expect("the fixture");
         let weights: Vec<Named> = file
             .tensors

@@ -5,13 +5,15 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use parallax::formats::safetensors;
-use parallax::monovit::{MonoVit, Preset};
+use parallax::monovit::Preset;
+use parallax::networks::DepthNetwork;
 use parallax::nn::{Context, Folded, Params};
 use parallax::tensor::{Shape, Tensor, Var};
 
-use crate::reference::error;
+use crate::reference::{error, fixture};
 
-fn fixture(name: &str) -> PathBuf {
+/// Path of a file under `tests/fixtures`.
+pub fn fixture_path(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)
 }
 
@@ -39,16 +41,27 @@ fn from_name(name: &str, shape: &Shape) -> Tensor<f64> {
     Tensor::from_vec(*shape, (0..shape.len() as u64).map(|i| f64::from(value(unit(name, i)) as f32)).collect())
 }
 
-fn input(name: &str) -> Var<f64> {
+/// A picture made from its name, `[1, 64, 96, 3]` in [0, 1].
+pub fn input(name: &str) -> Var<f64> {
     let image = from_name(name, &Shape::new(&[1, 3, 64, 96]));
     image.map(|x| 0.5 * x + 0.5).permute(&[0, 2, 3, 1]).into()
 }
 
+/// Weights made from the names, as far as `part` takes them; a shared tensor takes the value of its last one.
+pub fn fill_from_names(params: &mut Params<f64>, part: fn(&str) -> &str) {
+    let ids: Vec<_> = params.iter().map(|(id, _)| id).collect();
+    for id in ids {
+        let p = params.get(id);
+        let theirs = from_name(part(p.names.last().expect("a name")), p.layout.export(&p.value).shape());
+        let ours = p.layout.import(&theirs).expect("a layout that fits");
+        params.set(id, ours);
+    }
+}
+
 fn check(preset: Preset) {
     let size = preset.name();
-    let shapes: HashMap<String, serde_json::Value> =
-        serde_json::from_slice(&std::fs::read(fixture("shapes.json")).expect("the fixture")).expect("JSON");
-    let (model, mut params): (_, Params<f64>) = MonoVit::new(preset.config(), 0);
+    let shapes: HashMap<String, serde_json::Value> = serde_json::from_slice(&fixture("shapes.json")).expect("JSON");
+    let (model, mut params): (_, Params<f64>) = DepthNetwork::new(preset.config(), 0);
 
     // Names and shapes: ours and theirs are the same set.
     let theirs = shapes[size]["tensors"].as_object().expect("tensors by name");
@@ -68,15 +81,8 @@ fn check(preset: Preset) {
         assert_eq!(params.count(&format!("{part}.")) as u64, count.as_u64().expect("a count"), "{size}: {part}");
     }
 
-    // A shared tensor takes the value of its last name.
-    let ids: Vec<_> = params.iter().map(|(id, _)| id).collect();
-    for id in ids {
-        let p = params.get(id);
-        let theirs = from_name(p.names.last().expect("a name"), p.layout.export(&p.value).shape());
-        let ours = p.layout.import(&theirs).expect("a layout that fits");
-        params.set(id, ours);
-    }
-    let reference = safetensors::read::<f64>(&fixture("published.safetensors")).expect("the fixture").tensors;
+    fill_from_names(&mut params, |name| name);
+    let reference = safetensors::read::<f64>(&fixture_path("published.safetensors")).expect("the fixture").tensors;
     let c = Context::inference(&params);
     let features = model.features(&c, &input("input"));
     for (i, feature) in features.iter().enumerate() {

@@ -6,8 +6,9 @@ use std::sync::Arc;
 
 use parallax::formats::{TensorFile, safetensors};
 use parallax::monovit::loss::{LossConfig, Views, loss};
-use parallax::monovit::setup::check_size;
-use parallax::monovit::{Config, MonoVit, Preset};
+use parallax::monovit::{Config, Preset};
+use parallax::networks::DepthNetwork;
+use parallax::networks::setup::check_size;
 use parallax::nn::{Context, Folded, Named, fit};
 use parallax::ops::Conv2d;
 use parallax::random::{Random, Stream};
@@ -72,7 +73,7 @@ pub fn run(path: &Path) -> Result<()> {
 
     // Both without chance: DropPath is left out.
     let config = Config { drop_path: 0.0, ..preset.config() };
-    let (model, mut params) = MonoVit::new::<f32>(config, 0);
+    let (model, mut params) = DepthNetwork::new::<f32>(config, 0);
     let file = Arc::new(path.to_owned());
     let weights: Vec<Named> = (TensorFile::open(path)?.tensors.into_iter())
         .filter_map(|(origin, tensor)| {

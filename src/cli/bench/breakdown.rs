@@ -85,6 +85,7 @@ mod tests {
     use parallax::tensor::Precision;
     use std::time::Duration;
 
+    use crate::cli::architecture::ArchitectureArgs;
     use parallax::monovit::Preset;
     use parallax::tensor::profile;
 
@@ -92,7 +93,8 @@ mod tests {
     use crate::cli::bench::job::{Job, Network, measure};
     use crate::cli::sizes::Sizes;
 
-    const PICO: Sizes = Sizes { preset: Preset::Pico, height: 64, width: 96, batch: 1, recompute: false, json: false };
+    const NETWORKS: ArchitectureArgs = ArchitectureArgs { preset: Some(Preset::Pico), network: None, encoder: None };
+    const PICO: Sizes = Sizes { networks: NETWORKS, height: 64, width: 96, batch: 1, recompute: false, json: false };
 
     #[test]
     fn the_rows_of_a_training_step_add_up_to_the_traced_total() {

@@ -74,7 +74,7 @@ impl Network {
     /// The network of the given sizes, with a batch: for training, or for prediction in some numbers.
     pub fn new(sizes: &Sizes, seed: u64, infer: Option<Precision>) -> Result<Self> {
         sizes.check()?;
-        let mut config = RunConfig::new(sizes.preset, 1_000_000);
+        let mut config = RunConfig::new(sizes.architecture()?, 1_000_000);
         // The step as it is for most of the run.
         config.auto_mask_delay = 0.0;
         config.rotations.keep = 0.0;

@@ -74,8 +74,8 @@ pub fn run(args: &Args) -> Result<()> {
 
 /// Takes rounds of steps by turns, on the same samples.
 fn measure(args: &Args, data: &Arc<dyn DataSource>) -> Result<Speeds> {
-    let Sizes { preset, batch, .. } = args.sizes;
-    let config = RunConfig { auto_mask_delay: 0.0, ..RunConfig::new(preset, 1_000_000) };
+    let batch = args.sizes.batch;
+    let config = RunConfig { auto_mask_delay: 0.0, ..RunConfig::new(args.sizes.architecture()?, 1_000_000) };
     let mut trainer = Trainer::new(config.model(), config.plan());
     let (augment, seed) = (Augment::default(), 0);
     let n = args.iterations;

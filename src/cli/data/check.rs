@@ -59,6 +59,8 @@ struct Report {
 /// Time and memory of a training step on this machine.
 #[derive(Serialize)]
 struct Step {
+    /// The networks that take it.
+    networks: String,
     seconds: f64,
     bytes: f64,
 }
@@ -138,12 +140,16 @@ fn look(args: &Args) -> Result<Report> {
         width: sizes.width,
         batch: sizes.batch,
         data: args.dir.display().to_string(),
-        ..RunConfig::new(sizes.preset, STEPS)
+        ..RunConfig::new(sizes.architecture()?, STEPS)
     };
     match check_memory(&config) {
         Ok(()) => {
-            let cost = Cost::of(&sizes.preset.config(), [sizes.height, sizes.width], sizes.batch, false)?;
-            report.step = Some(Step { seconds: cost.seconds_step, bytes: cost.bytes_step });
+            let cost = Cost::of(config.model(), [sizes.height, sizes.width], sizes.batch, false)?;
+            report.step = Some(Step {
+                networks: config.architecture().name(),
+                seconds: cost.seconds_step,
+                bytes: cost.bytes_step,
+            });
         }
         Err(error) => report.faults.push(error.to_string()),
     }
@@ -168,11 +174,11 @@ fn print(args: &Args, report: &Report) {
     for fit in &report.camera_fit {
         say!("from {} on {}", fit.first, fit.in_words());
     }
-    if let Some(Step { seconds, bytes }) = report.step {
+    if let Some(Step { networks, seconds, bytes }) = &report.step {
         let sizes = &args.sizes;
         say!(
             "a step of {}, batch {}, takes about {seconds:.2} s on this machine and {:.0} MiB: 1000 steps in {:.0} minutes",
-            sizes.preset.name(),
+            networks,
             sizes.batch,
             bytes / f64::from(1 << 20),
             1000.0 * seconds / 60.0

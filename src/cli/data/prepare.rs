@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::Mutex;
 
 use parallax::data::prepared::prepare;
-use parallax::monovit::setup::check_size;
+use parallax::networks::setup::check_size;
 use parallax::{Error, Result};
 
 use crate::cli::film::FilmArgs;

@@ -4,7 +4,7 @@ use parallax::camera::Intrinsics;
 use parallax::data::inputs::Input;
 use parallax::eval::camera_height::find_ground;
 use parallax::eval::metrics::STEREO_SCALE;
-use parallax::monovit::Setup;
+use parallax::networks::Setup;
 use parallax::weights::{Metres, Origin};
 use parallax::{Error, Result};
 
@@ -39,10 +39,10 @@ impl<'a> Scaling<'a> {
     /// Says which network predicts, what it was trained on, and in which unit, where the weights know that.
     pub fn tell(&self, weights: &WeightsArgs, setup: &Setup, numbers: usize) {
         let Some(origin) = self.origin else { return };
-        let (preset, millions) = (setup.preset.name(), numbers as f64 / 1e6);
+        let (networks, millions) = (setup.architecture().name(), numbers as f64 / 1e6);
         let (height, width) = (setup.height, setup.width);
         let trained = origin.in_words();
-        note!("weights {}: {preset}, {millions:.1} million parameters, trained on {trained}", weights.name());
+        note!("weights {}: {networks}, {millions:.1} million parameters, trained on {trained}", weights.name());
         match self.known() {
             Some(metres) => {
                 let whose = if self.args.fov.is_some() || self.args.intrinsics.is_some() {

@@ -5,7 +5,7 @@ use super::{Group, Shown};
 use crate::data::DataSource;
 use crate::data::batch::to_tensor;
 use crate::error::Result;
-use crate::eval::attention::attention;
+use crate::eval::attention::{attention, saliency};
 use crate::eval::odometry::{Odometry, joined};
 use crate::eval::predictor::Predictor;
 use crate::eval::trajectory::Pose;
@@ -16,6 +16,8 @@ use crate::report::overlay::{Overlay, mark};
 const PATH: usize = 100;
 /// The error, as a share of the true depth, that is brightest.
 const WORST: f64 = 0.5;
+/// Half the width of the square around a query pixel whose disparity's gradient is shown, in pixels.
+const RADIUS: usize = 1;
 /// Query pixels of attention: row and column, as shares of the picture.
 const QUERIES: [[f64; 2]; 3] = [[0.8, 0.5], [0.55, 0.2], [0.5, 0.75]];
 
@@ -74,18 +76,23 @@ pub(super) fn error_group(
     Ok(Some(Group { kind: kind.into(), about: format!("{}, Abs Rel {mean:.3}", data.name(sample)), views }))
 }
 
-/// The places that a few pixels of the first sample look at; nothing in networks without transformer paths.
+/// The places that a few pixels of the first sample look at; in networks without attention, what their disparities depend on.
 pub(super) fn attention_group(place: &Place, shown: &Shown) -> Result<Option<Group>> {
     let image = shown.data.image(0, 0)?;
     let (w, h) = image.dimensions();
     let (seen, overlay) = (to_tensor(&[&image]), Overlay::new(&image));
-    let mut views = Vec::new();
+    let (mut views, mut looks) = (Vec::new(), false);
     for (i, [y, x]) in QUERIES.into_iter().enumerate() {
         let pixel = [(y * f64::from(h)) as usize, (x * f64::from(w)) as usize];
         let found = attention(shown.model, shown.params, &seen, pixel);
         // The last layer of the first path, at 1/8 of the picture: fine enough to be seen.
-        let Some(rows) = found.rows.iter().rfind(|rows| rows.stage == 1 && rows.path == 0) else { continue };
-        let map = rows.mean();
+        let rows = found.rows.iter().rfind(|rows| rows.stage == 1 && rows.path == 0);
+        looks |= rows.is_some();
+        let map = match rows {
+            Some(rows) => rows.mean(),
+            // Gradients fall off steeply: their square root shows what lies beside the pixel too.
+            None => saliency(shown.model, shown.params, &seen, pixel, RADIUS).map(f32::sqrt),
+        };
         let &[rows, columns] = map.dims() else { unreachable!("maps have two dimensions") };
         let mut made = overlay.signed(map.data(), (rows, columns));
         mark(&mut made, pixel[1] as f32, pixel[0] as f32);
@@ -95,9 +102,12 @@ pub(super) fn attention_group(place: &Place, shown: &Shown) -> Result<Option<Gro
             &made,
         )?);
     }
-    let about =
-        format!("{}: warm is looked at, cold is looked away from (last layer at 1/8 of the size)", shown.data.name(0));
-    Ok((!views.is_empty()).then(|| Group { kind: "Attention of query pixels".into(), about, views }))
+    let (kind, about) = match looks {
+        true => ("Attention", "warm is looked at, cold is looked away from (last layer at 1/8 of the size)"),
+        false => ("Saliency", "warm is what the disparity around the pixel depends on (the gradient by the picture)"),
+    };
+    let about = format!("{}: {about}", shown.data.name(0));
+    Ok((!views.is_empty()).then(|| Group { kind: format!("{kind} of query pixels"), about, views }))
 }
 
 /// The camera's path over frames that follow one another, from above; empty if there are no such frames at the beginning.

@@ -1,41 +1,48 @@
-//! The whole of MonoViT: four networks over one set of parameters.
+//! The networks that are trained together: encoder, decoder, pose network, over one set of parameters.
 
-use super::config::Config;
-use super::decoder::Decoder;
-use super::encoder::Encoder;
-use super::pose::{PoseDecoder, PoseEncoder};
-use crate::nn::{Builder, Context, Folded, Params};
+use super::{AnyDecoder, AnyEncoder, Config};
+use crate::monovit::pose::{PoseDecoder, PoseEncoder};
+use crate::nn::{Builder, Context, Conv, Folded, ParamId, Params};
 use crate::random::{Random, Stream};
 use crate::tensor::{Float, Tensor, Var, profile};
 
-/// MonoViT: depth encoder and decoder, pose encoder and decoder: `encoder`, `depth`, `pose_encoder`, `pose` in a
-/// checkpoint.
+/// A depth network and the pose network that it is trained with: `encoder`, `depth`, `pose_encoder`, `pose` in a checkpoint.
 #[derive(Clone, Debug)]
-pub struct MonoVit {
+pub struct DepthNetwork {
     /// The sizes.
     pub config: Config,
-    encoder: Encoder,
-    depth: Decoder,
+    encoder: AnyEncoder,
+    depth: AnyDecoder,
     pose_encoder: PoseEncoder,
     pose: PoseDecoder,
 }
 
-impl MonoVit {
+impl DepthNetwork {
     /// The networks, and their parameters as they start, drawn from `seed`.
-    pub fn new<T: Float>(config: Config, seed: u64) -> (Self, Params<T>) {
+    ///
+    /// # Panics
+    /// If [`Config::check`] refuses the sizes.
+    #[track_caller]
+    pub fn new<T: Float>(config: impl Into<Config>, seed: u64) -> (Self, Params<T>) {
+        let config: Config = config.into();
         let (mut params, mut random) = (Params::new(), Random::of(seed, Stream::Weights));
         let b = &mut Builder::new(&mut params, &mut random).starting(config.start);
-        let model = MonoVit {
-            encoder: Encoder::new(&mut b.at("encoder"), &config),
-            depth: Decoder::new(&mut b.at("depth"), &config),
-            pose_encoder: PoseEncoder::new(&mut b.at("pose_encoder"), &config),
-            pose: PoseDecoder::new(&mut b.at("pose"), &config),
+        let model = DepthNetwork {
+            encoder: config.encoder.build(&mut b.at("encoder")),
+            depth: config.decoder.build(&mut b.at("depth"), &config.encoder.maps()),
+            pose_encoder: PoseEncoder::new(&mut b.at("pose_encoder"), config.pose),
+            pose: PoseDecoder::new(&mut b.at("pose"), config.pose),
             config,
         };
         (model, params)
     }
 
-    /// The encoder's five maps of an image `[B, H, W, 3]` in [0, 1].
+    /// The biases of the convolutions whose sigmoid the disparities are, largest disparity first.
+    pub fn head_biases(&self) -> Vec<ParamId> {
+        self.depth.heads().iter().filter_map(Conv::bias).collect()
+    }
+
+    /// The encoder's maps, largest first, of an image `[B, H, W, 3]` in [0, 1].
     #[track_caller]
     pub fn features<T: Float>(&self, c: &Context<T>, image: &Var<T>) -> Vec<Var<T>> {
         self.encoder.forward(c, image)
@@ -47,7 +54,7 @@ impl MonoVit {
         self.depth.forward(c, &self.features(c, image))
     }
 
-    /// [`disparities`](MonoVit::disparities) for inference, as plain tensors: nothing is recorded, and normalisations
+    /// [`disparities`](DepthNetwork::disparities) for inference, as plain tensors: nothing is recorded, and normalisations
     /// are folded into convolutions.
     ///
     /// Pictures run side by side, one on a thread, so that what a layer computes is still in its core's cache when the

@@ -4,14 +4,22 @@ use std::collections::HashMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Ablation, Config, Preset};
+use super::{Architecture, Config, EncoderKind, Network};
 use crate::error::{Error, Result};
+use crate::monovit::loss::check_depths;
+use crate::monovit::{Ablation, Preset};
 
 /// The networks that weights belong to, the pictures they were trained on, and the depths that a disparity stands for.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Setup {
     /// The named size of the networks.
     pub preset: Preset,
+    /// The network; MonoViT in files that do not say it.
+    #[serde(default)]
+    pub network: Network,
+    /// The depth encoder; MPViT in files that do not say it.
+    #[serde(default)]
+    pub encoder: EncoderKind,
     /// The parts that are taken away from it.
     #[serde(default)]
     pub ablation: Ablation,
@@ -29,18 +37,30 @@ pub struct Setup {
 const KEY: &str = "parallax";
 
 impl Setup {
-    /// The usual setup of a size: the published picture size, depths from 0.1 to 100.
-    pub fn of(preset: Preset) -> Self {
+    /// The usual setup of an architecture (or, given a preset, of MonoViT in that size): the published picture size, depths
+    /// from 0.1 to 100.
+    pub fn of(architecture: impl Into<Architecture>) -> Self {
+        let Architecture { network, encoder, preset } = architecture.into();
         let (height, width) = match preset {
             Preset::Pico | Preset::Nano => (96, 320),
             Preset::Tiny | Preset::Xsmall | Preset::Small | Preset::Base => (192, 640),
         };
-        Setup { preset, ablation: Ablation::default(), height, width, min_depth: 0.1, max_depth: 100.0 }
+        let ablation = Ablation::default();
+        Setup { preset, network, encoder, ablation, height, width, min_depth: 0.1, max_depth: 100.0 }
+    }
+
+    /// The names of the networks.
+    pub fn architecture(&self) -> Architecture {
+        Architecture { network: self.network, encoder: self.encoder, preset: self.preset }
     }
 
     /// The sizes of the networks.
+    ///
+    /// # Panics
+    /// If [`check`](Setup::check) refuses them.
+    #[track_caller]
     pub fn model(&self) -> Config {
-        self.ablation.apply(self.preset.config())
+        self.architecture().config(&self.ablation).unwrap_or_else(|error| panic!("networks of no use: {error}"))
     }
 
     /// Checks every field.
@@ -51,7 +71,7 @@ impl Setup {
         check_size("height", self.height)?;
         check_size("width", self.width)?;
         check_depths("min_depth", self.min_depth, self.max_depth)?;
-        self.ablation.check(&self.preset.config())
+        self.architecture().config(&self.ablation).map(drop)
     }
 
     /// The metadata of a file of weights that belong to this setup.
@@ -97,17 +117,6 @@ pub fn check_size(field: &str, size: usize) -> Result<()> {
     Ok(())
 }
 
-/// Checks a range of depths.
-///
-/// # Errors
-/// If it is empty, or reaches 0 or infinity.
-pub(super) fn check_depths(field: &str, min: f64, max: f64) -> Result<()> {
-    if min > 0.0 && min < max && max.is_finite() {
-        return Ok(());
-    }
-    Err(Error::setting(field, format!("{min} to {max} is no range of depths above 0")))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -121,6 +130,9 @@ mod tests {
         let metadata = HashMap::from([(KEY.to_owned(), earlier.to_owned())]);
         assert_eq!(Setup::from_metadata(&metadata).unwrap(), Some(setup));
         assert_eq!(Setup::from_metadata(&HashMap::new()).unwrap(), None);
+        let other = Setup::of(Architecture::of(Network::Monodepth2, Preset::Nano));
+        assert_eq!(Setup::from_metadata(&other.metadata().unwrap()).unwrap(), Some(other));
+        assert_eq!((other.network, other.encoder), (Network::Monodepth2, EncoderKind::Resnet18));
     }
 
     #[test]
@@ -130,6 +142,10 @@ mod tests {
             ("width", r#"{"preset":"nano","height":96,"width":9000000,"min_depth":0.1,"max_depth":100.0}"#),
             ("min_depth", r#"{"preset":"nano","height":96,"width":320,"min_depth":0.0,"max_depth":100.0}"#),
             ("parallax", r#"{"preset":"nano","height":96}"#),
+            (
+                "preset",
+                r#"{"preset":"base","network":"monovit","encoder":"resnet34","height":96,"width":320,"min_depth":0.1,"max_depth":100.0}"#,
+            ),
         ] {
             let metadata = HashMap::from([(KEY.to_owned(), text.to_owned())]);
             let error = Setup::from_metadata(&metadata).unwrap_err().to_string();
