@@ -61,7 +61,7 @@ fn assert_fits() {
     // A folder's pictures are not held: a step is all there is.
     let usual = RunConfig { preset: Preset::Pico, data: "frames".into(), batch: 6, ..RunConfig::usual() };
     let of = |batch: usize, recompute: bool| {
-        Cost::of(&Preset::Pico.config(), [96, 320], batch, recompute).expect("counted").bytes_step
+        Cost::of(Preset::Pico.config(), [96, 320], batch, recompute).expect("counted").bytes_step
     };
     let fit = |most: f64| {
         let mut config = usual.clone();

@@ -9,7 +9,8 @@ use std::process::{Child, Command, Stdio};
 
 use image::{ImageFormat, Rgb, RgbImage};
 use parallax::formats::npy;
-use parallax::monovit::{MonoVit, Preset};
+use parallax::monovit::Preset;
+use parallax::networks::DepthNetwork;
 use parallax::train::RunConfig;
 use parallax::train::run::write_weights;
 
@@ -30,7 +31,7 @@ impl Drop for View {
 fn weights(folder: &Path) -> PathBuf {
     let path = folder.join("pico.safetensors");
     let config = RunConfig { height: 64, width: 96, ..RunConfig::new(Preset::Pico, 1) };
-    let (_, params) = MonoVit::new::<f32>(config.model(), 11);
+    let (_, params) = DepthNetwork::new::<f32>(config.model(), 11);
     write_weights(&path, &params, &config.setup()).expect("weights");
     path
 }

@@ -22,7 +22,7 @@ pub struct Fitted {
 /// # Errors
 /// If even single samples do not fit, with the memory that they need; if a step on small pictures cannot be taken.
 pub fn fit_memory(config: &mut RunConfig, most: f64) -> Result<Fitted> {
-    let network = config.ablation.apply(config.preset.config());
+    let network = config.architecture().config(&config.ablation)?;
     let held = bytes_held(config);
     let mut least = f64::INFINITY;
     for parts in (1..=config.batch).filter(|parts| config.batch.is_multiple_of(*parts)) {
@@ -31,7 +31,7 @@ pub fn fit_memory(config: &mut RunConfig, most: f64) -> Result<Fitted> {
                 continue;
             }
             let batch = config.batch / parts;
-            let cost = Cost::of(&network, [config.height, config.width], batch, recompute)?;
+            let cost = Cost::of(network.clone(), [config.height, config.width], batch, recompute)?;
             // The sum of the parts' gradients stays between them.
             let sums = if parts * config.accumulate > 1 { cost.bytes_parameters } else { 0.0 };
             let bytes = held + cost.bytes_step + sums;
