@@ -14,6 +14,7 @@
 //! | [`pfm`] | reading disparity as Middlebury stores it |
 //! | [`mat`] | reading an array of a MATLAB 5 file |
 //! | [`ply`] | coloured point clouds |
+//! | [`tensorboard`] | TensorBoard's event files |
 //!
 //! [`TensorFile`] opens any file of named tensors.
 
@@ -34,6 +35,7 @@ pub mod pth;
 pub mod safetensors;
 mod source;
 mod stored;
+pub mod tensorboard;
 mod tensor_file;
 
 pub use stored::{Dtype, StoredTensor};

@@ -3,7 +3,8 @@
 //! `RUN/config.toml` (all of it, to run it again), `log.jsonl` (a line a logged step and a validation), `warnings.jsonl` (a
 //! line where a warning of [`health`](super::health) begins or ends), `checkpoints/` (the whole state, and the one before
 //! it), `best.safetensors` and `last.safetensors`, `metrics.json`, `images/` (of the last
-//! validation), `pages/` (a few of every validation), `views/` ([`views`](super::views) of the last).
+//! validation), `pages/` (a few of every validation), `views/` ([`views`](super::views) of the last), and if asked for
+//! `tensorboard/`.
 //!
 //! What is computed is never lost: the state is written before anything is measured, and nothing that only concerns
 //! reporting ends a training.
@@ -20,6 +21,7 @@ use super::log::{self, Log};
 use super::recipe::{RunConfig, read_config};
 use super::start::Start;
 use super::state::{self, Notes};
+use super::tensorboard::Board;
 use super::trainer::{StepReport, Trainer};
 pub use super::validation::{RunMetrics, Validation};
 use crate::data::DataSource;
@@ -87,6 +89,8 @@ pub struct Run {
     pub(super) trainer: Trainer,
     pub(super) notes: Notes,
     pub(super) skipped: SkipList,
+    /// TensorBoard's events, while they are written.
+    pub(super) board: Option<Board>,
     /// Held while this process has the run.
     _lock: File,
 }
@@ -135,6 +139,7 @@ impl Run {
             trainer,
             notes: Notes::default(),
             skipped: SkipList::default(),
+            board: None,
             _lock: lock,
         };
         run.save()?;
@@ -177,7 +182,8 @@ impl Run {
             write_config(folder, &config)?;
         }
         log::forget_after(folder, trainer.steps(), notes.validated)?;
-        Ok(Run { folder: folder.to_owned(), config, trainer, notes, skipped: SkipList::default(), _lock: lock })
+        let skipped = SkipList::default();
+        Ok(Run { folder: folder.to_owned(), config, trainer, notes, skipped, board: None, _lock: lock })
     }
 
     /// Steps done.
@@ -208,6 +214,7 @@ impl Run {
         let validation = self.validation_batches(data, &mut tell);
         let mut log = Log::open(&self.folder, log::LOG)?;
         let mut health = Health::open(&self.folder)?;
+        self.open_board(&mut tell);
         if !self.learn_rotations(data, &stop, &mut tell)? {
             // The state on disk is that before the first of these steps: they will be taken again.
             return Ok(Ended::Interrupted(0));
@@ -226,7 +233,7 @@ impl Run {
             let next: Result<Vec<Batch>> = (0..accumulate).map(|_| loader.next_batch()).collect();
             let report = match next.and_then(|batches| {
                 waited += asked.elapsed().as_secs_f64();
-                self.trainer.step_of(&batches)
+                self.step_of(&batches)
             }) {
                 Ok(report) => report,
                 Err(error) => {
@@ -244,6 +251,7 @@ impl Run {
                 let n = f64::from(counted);
                 let (seconds, data_seconds) = (since.elapsed().as_secs_f64() / n, waited / n);
                 log.write(&StepLine { step: report, seconds, data_seconds })?;
+                self.board_gets(|board, _| board.step(&report, [seconds, data_seconds]), &mut tell);
                 health.see(&report, &mut tell)?;
                 self.notes.seconds += since.elapsed().as_secs_f64();
                 (since, waited, counted) = (Instant::now(), 0.0, 0);
@@ -266,7 +274,18 @@ impl Run {
         if self.trainer.steps() < self.config.steps {
             tell(Event::Phase(&format!("stopping: no new best in {} validations", self.notes.since_best)));
         }
-        Ok(Ended::Finished(Box::new(self.finish(data, mean_map, &mut tell)?)))
+        Ok(Ended::Finished(Box::new(self.finish(data, mean_map, &mut log, &mut tell)?)))
+    }
+
+    /// Takes a step; where its weights are validated next, TensorBoard gets its gradients.
+    fn step_of(&mut self, batches: &[Batch]) -> Result<StepReport> {
+        let watched = self.validates_after(self.trainer.steps() + 1);
+        let board = self.board.as_mut().filter(|_| watched);
+        self.trainer.step_watched(batches, |trainer, gradients| {
+            if let Some(board) = board {
+                board.see_gradients(trainer, gradients);
+            }
+        })
     }
 
     /// Whether validation has found no new best for as long as the configuration waits.
@@ -276,8 +295,12 @@ impl Run {
 
     /// Whether the state is written after the step that was taken last.
     fn checkpoint_is_due(&self) -> bool {
-        let steps = self.trainer.steps();
-        steps.is_multiple_of(self.config.checkpoint_every) || steps == self.config.steps
+        self.validates_after(self.trainer.steps())
+    }
+
+    /// Whether the state is written, and its weights are validated, after a step.
+    fn validates_after(&self, step: u64) -> bool {
+        step.is_multiple_of(self.config.checkpoint_every) || step == self.config.steps
     }
 
     /// Whether a checkpoint's weights have not been validated: the run stopped in between.
@@ -362,10 +385,18 @@ pub(super) const CHECKPOINTS: &str = "checkpoints";
 pub(super) const PAGES: &str = "pages";
 /// The folder of [`views`](super::views).
 pub(super) const VIEWS: &str = "views";
+/// The folder of TensorBoard's events.
+pub(super) const TENSORBOARD: &str = "tensorboard";
 const LOCK: &str = ".lock";
 
+/// Whether a process is training the run of a folder now, as far as that can be told.
+pub fn is_running(folder: &Path) -> bool {
+    // Held for this moment alone, by a handle that is closed at once.
+    File::open(folder.join(LOCK)).is_ok_and(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)))
+}
+
 /// Takes the run for this process, until the file is closed, be it by a crash.
-fn lock(folder: &Path) -> Result<File> {
+pub(super) fn lock(folder: &Path) -> Result<File> {
     let path = folder.join(LOCK);
     let file = File::create(&path).map_err(|e| Error::io(&path, e))?;
     match file.try_lock() {

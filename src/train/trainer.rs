@@ -87,7 +87,7 @@ pub struct Trainer {
     pub(super) average: Option<Average<f32>>,
     ties: TieBreak<f32>,
     /// The part that each parameter belongs to.
-    parts: Vec<usize>,
+    pub(super) parts: Vec<usize>,
     frozen: Frozen,
 }
 
@@ -273,6 +273,15 @@ impl Trainer {
     /// # Panics
     /// If there is no batch.
     pub fn step_of(&mut self, batches: &[Batch]) -> Result<StepReport> {
+        self.step_watched(batches, |_, _| ())
+    }
+
+    /// [`step_of`](Trainer::step_of), of which `watch` sees the gradients, parameter by parameter, as the optimiser gets them.
+    pub(super) fn step_watched(
+        &mut self,
+        batches: &[Batch],
+        watch: impl FnOnce(&Self, &[Option<Tensor<f32>>]),
+    ) -> Result<StepReport> {
         let step = self.adamw.steps + 1;
         let mut sum: Vec<Option<Tensor<f32>>> = Vec::new();
         let mut reports = Vec::new();
@@ -294,6 +303,7 @@ impl Trainer {
             scale(&mut sum, 1.0 / batches.len() as f64);
         }
         let (grad_norms, grad_norm) = self.clip(&mut sum, &reports)?;
+        watch(self, &sum);
         let factor = self.plan.schedule.factor(step);
         let learning_rates =
             [self.plan.optim.encoder_rate, self.plan.optim.rate, self.plan.optim.pose_rate].map(|r| r * factor);
