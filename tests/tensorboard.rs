@@ -21,7 +21,8 @@ fn street(seed: u64) -> Arc<dyn DataSource> {
 /// What a folder of event files says, by tag and step, after the rule of every reader: a session that begins at a step
 /// takes back what was said of it and later ones.
 fn told(folder: &Path) -> BTreeMap<String, BTreeMap<i64, Vec<Worth>>> {
-    let mut files: Vec<_> = fs::read_dir(folder).expect("a folder").map(|entry| entry.expect("a file").path()).collect();
+    let mut files: Vec<_> =
+        fs::read_dir(folder).expect("a folder").map(|entry| entry.expect("a file").path()).collect();
     files.sort();
     let mut found: BTreeMap<String, BTreeMap<i64, Vec<Worth>>> = BTreeMap::new();
     for path in files {
@@ -30,7 +31,9 @@ fn told(folder: &Path) -> BTreeMap<String, BTreeMap<i64, Vec<Worth>>> {
         assert_eq!(file.events[0].what, Some(What::FileVersion(FILE_VERSION.into())));
         for event in file.events {
             match event.what {
-                Some(What::SessionLog(_)) => found.values_mut().for_each(|steps| steps.retain(|step, _| *step < event.step)),
+                Some(What::SessionLog(_)) => {
+                    found.values_mut().for_each(|steps| steps.retain(|step, _| *step < event.step))
+                }
                 Some(What::Summary(summary)) => {
                     for point in summary.points {
                         let values = found.entry(point.tag).or_default().entry(event.step).or_default();
@@ -50,7 +53,8 @@ fn a_run_that_was_killed_and_went_on_has_every_step_once_and_as_its_log_says() {
     let folder = place.path().join("run");
     let data = RunData { train: street(1), validation: street(2), test: Some(street(3)) };
     let usual = RunConfig::new(Preset::Pico, 4);
-    let config = RunConfig { height: 32, width: 64, batch: 2, log_every: 1, checkpoint_every: 2, tensorboard: true, ..usual };
+    let config =
+        RunConfig { height: 32, width: 64, batch: 2, log_every: 1, checkpoint_every: 2, tensorboard: true, ..usual };
     let config = RunConfig { rotations: Rotations::default(), ..config };
 
     // What a killed program leaves: the state of step 2, and events of step 3.
@@ -102,7 +106,9 @@ fn a_run_that_was_killed_and_went_on_has_every_step_once_and_as_its_log_says() {
     assert_eq!((&steps[..], &validations[..]), (&[1, 2, 3, 4][..], &[2, 4][..]));
     assert!(found["training/loss"].keys().eq(&steps) && found["validation/warped"].keys().eq(&validations));
     assert_eq!(value("test/abs_rel", 4), metrics.after.expect("measured").abs_rel as f32);
-    for (what, part) in [("weights", "encoder"), ("gradients", "encoder"), ("gradients", "decoder"), ("weights", "pose")] {
+    for (what, part) in
+        [("weights", "encoder"), ("gradients", "encoder"), ("gradients", "decoder"), ("weights", "pose")]
+    {
         for step in &validations {
             let tag = format!("{what}/{part}");
             let [Worth::Histogram(histogram)] = &found[&tag][step][..] else { panic!("{tag} of step {step}") };

@@ -35,8 +35,8 @@ pub mod pth;
 pub mod safetensors;
 mod source;
 mod stored;
-pub mod tensorboard;
 mod tensor_file;
+pub mod tensorboard;
 
 pub use stored::{Dtype, StoredTensor};
 pub use tensor_file::TensorFile;

@@ -9,14 +9,22 @@
 //! What is computed is never lost: the state is written before anything is measured, and nothing that only concerns
 //! reporting ends a training.
 
-use std::fs::{self, File, TryLockError};
+mod files;
+mod health;
+
+use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
 use serde::Serialize;
 
-use super::health::{Monitor, Warning};
+pub(super) use files::{BEST, CHECKPOINTS, LAST, PAGES, TENSORBOARD, VIEWS, lock};
+use files::{LOCK, write_config};
+pub use files::{is_running, load_weights, write_weights};
+use health::Health;
+
+use super::health::Warning;
 use super::log::{self, Log};
 use super::recipe::{RunConfig, read_config};
 use super::start::Start;
@@ -27,11 +35,7 @@ pub use super::validation::{RunMetrics, Validation};
 use crate::data::DataSource;
 use crate::data::batch::{Batch, Loader, SkipList};
 use crate::error::{Error, Result};
-use crate::formats::atomic::{self, check_writable, write_bytes_atomically};
-use crate::formats::safetensors;
-use crate::monovit::{MonoVit, Setup};
-use crate::nn::Params;
-use crate::weights::{self, Need, Weights};
+use crate::formats::atomic::{self, check_writable};
 
 /// The samples that a run trains on, validates on and reports on. None is in two of them.
 pub struct RunData {
@@ -348,80 +352,4 @@ impl Run {
         let weights = self.trainer.weights();
         write_weights(&self.folder.join(BEST), &weights, &self.config.setup())
     }
-}
-
-/// The monitor of a run, and where it writes to.
-struct Health {
-    monitor: Monitor,
-    log: Log,
-}
-
-impl Health {
-    /// A monitor that has seen what the run has logged already.
-    fn open(folder: &Path) -> Result<Self> {
-        let mut monitor = Monitor::default();
-        log::steps(folder)?.iter().for_each(|step| drop(monitor.see(step)));
-        Ok(Health { monitor, log: Log::open(folder, log::WARNINGS)? })
-    }
-
-    fn see(&mut self, step: &StepReport, tell: &mut impl FnMut(Event)) -> Result<()> {
-        for warning in self.monitor.see(step) {
-            self.log.write(&warning)?;
-            if warning.first {
-                tell(Event::Health(&warning));
-            }
-        }
-        Ok(())
-    }
-}
-
-/// The file of the weights that validation chose.
-pub(super) const BEST: &str = "best.safetensors";
-/// The file of the weights that training ended with.
-pub(super) const LAST: &str = "last.safetensors";
-/// The folder of states.
-pub(super) const CHECKPOINTS: &str = "checkpoints";
-/// The folder of pictures as training goes on, `STEP-SAMPLE.jpg`.
-pub(super) const PAGES: &str = "pages";
-/// The folder of [`views`](super::views).
-pub(super) const VIEWS: &str = "views";
-/// The folder of TensorBoard's events.
-pub(super) const TENSORBOARD: &str = "tensorboard";
-const LOCK: &str = ".lock";
-
-/// Whether a process is training the run of a folder now, as far as that can be told.
-pub fn is_running(folder: &Path) -> bool {
-    // Held for this moment alone, by a handle that is closed at once.
-    File::open(folder.join(LOCK)).is_ok_and(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)))
-}
-
-/// Takes the run for this process, until the file is closed, be it by a crash.
-pub(super) fn lock(folder: &Path) -> Result<File> {
-    let path = folder.join(LOCK);
-    let file = File::create(&path).map_err(|e| Error::io(&path, e))?;
-    match file.try_lock() {
-        Ok(()) => Ok(file),
-        Err(TryLockError::WouldBlock) => {
-            Err(Error::file(folder, "another process is training this run: wait for it, or give another folder"))
-        }
-        // Some network file systems have no locks: better a run without one than none.
-        Err(TryLockError::Error(e)) if e.kind() == std::io::ErrorKind::Unsupported => Ok(file),
-        Err(TryLockError::Error(e)) => Err(Error::io(&path, e)),
-    }
-}
-
-fn write_config(folder: &Path, config: &RunConfig) -> Result<()> {
-    let text = toml::to_string(config).map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
-    write_bytes_atomically(folder.join("config.toml"), text.as_bytes())
-}
-
-/// Writes weights for use: PyTorch's names and layouts, their setup in the metadata.
-pub fn write_weights(path: &Path, params: &Params<f32>, setup: &Setup) -> Result<()> {
-    safetensors::write(path, &params.export(), setup.metadata()?)
-}
-
-/// Reads weights to predict depth with: a run's folder, or a file or folder of any kind that [`weights::load`] reads.
-pub fn load_weights(path: &Path) -> Result<(MonoVit, Params<f32>, Setup)> {
-    let Weights { model, params, setup, .. } = weights::load(&[path.to_owned()], Need::Depth, false)?;
-    Ok((model, params, setup))
 }

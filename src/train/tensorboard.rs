@@ -32,7 +32,8 @@ impl Run {
     pub(super) fn open_board(&mut self, tell: &mut impl FnMut(Event)) {
         if self.config.tensorboard {
             let writer = EventWriter::create(&self.folder.join(TENSORBOARD), self.trainer.steps() + 1);
-            let told = writer.inspect_err(|e| tell(Event::Warning(&format!("nothing is written for TensorBoard: {e}"))));
+            let told =
+                writer.inspect_err(|e| tell(Event::Warning(&format!("nothing is written for TensorBoard: {e}"))));
             self.board = told.ok().map(|writer| Board { writer, gradients: Vec::new() });
         }
     }

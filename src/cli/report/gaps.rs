@@ -43,7 +43,9 @@ pub fn of(folder: &Path, run: &Record) -> Vec<Gap> {
         let how = match (run.running, weights) {
             (true, _) => "its next validation leaves them",
             (false, true) => "`parallax report RUN --views` makes them from its weights",
-            (false, false) => "there are no weights to make them from: copy best.safetensors into the folder, then use --views",
+            (false, false) => {
+                "there are no weights to make them from: copy best.safetensors into the folder, then use --views"
+            }
         };
         add("there are no views: no errors, warped neighbours, attention, path or worst samples", how);
     }

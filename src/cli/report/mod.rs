@@ -124,7 +124,7 @@ fn tell_apart(runs: &mut [Record]) {
 /// Writes the page of a run into its folder. A failure is told and does not end a training.
 pub fn leave(folder: &Path, running: bool) {
     // The lock of a run that has just ended is still held by this process.
-    let page = Record::read(folder).map(|run| page::page(&[Record { running, ..run }], &[]));
+    let page = Record::read_as(folder, running).map(|run| page::page(&[run], &[]));
     if let Err(error) = page.and_then(|page| write_bytes_atomically(folder.join(PAGE), page.as_bytes())) {
         note!("warning: the page of the run could not be written: {error}");
     }

@@ -54,6 +54,14 @@ impl Record {
     /// # Errors
     /// If it holds neither a log nor a configuration of a run.
     pub fn read(folder: &Path) -> Result<Self> {
+        Self::read_as(folder, is_running(folder))
+    }
+
+    /// Reads a folder of which is known whether it is being trained.
+    ///
+    /// # Errors
+    /// As [`read`](Record::read).
+    pub fn read_as(folder: &Path, running: bool) -> Result<Self> {
         if !folder.join("log.jsonl").is_file() && !folder.join("config.toml").is_file() {
             let message =
                 "holds no run: expected log.jsonl or config.toml in it. Give a folder that `parallax train` made";
@@ -65,7 +73,7 @@ impl Record {
         let of = |field: &str| log.iter().filter(|line| line[field].is_u64()).cloned().collect::<Vec<_>>();
         let mut record = Record {
             name: name_of(folder),
-            running: is_running(folder),
+            running,
             steps: of("step"),
             validations: of("validated"),
             pages: of("page"),

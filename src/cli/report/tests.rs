@@ -168,7 +168,8 @@ fn what_an_old_folder_lacks_is_named_with_the_way_to_get_it() {
     let folder = tempfile::tempdir().unwrap();
     let place = folder.path();
     fs::write(place.join("config.toml"), "steps = 3\n").unwrap();
-    fs::write(place.join("log.jsonl"), "{\"step\":3,\"loss\":0.5}\n{\"validated\":3,\"photometric\":0.1}\n{\"val").unwrap();
+    fs::write(place.join("log.jsonl"), "{\"step\":3,\"loss\":0.5}\n{\"validated\":3,\"photometric\":0.1}\n{\"val")
+        .unwrap();
     let words = |folder: &std::path::Path| {
         let run = Record::read(folder).unwrap();
         let gaps: Vec<String> = run.gaps.iter().map(|gap| format!("{} | {}", gap.what, gap.how)).collect();

@@ -158,7 +158,10 @@ pub fn compared(runs: &[Record], verdicts: &[Verdict]) -> Vec<String> {
     if !alike {
         words.push("Their errors are not of the same kind and cannot be compared.".into());
     } else if !differ.is_empty() {
-        words.push(format!("Their errors are of different pictures ({} differ) and cannot be compared.", differ.join(", ")));
+        words.push(format!(
+            "Their errors are of different pictures ({} differ) and cannot be compared.",
+            differ.join(", ")
+        ));
     } else {
         let mut order: Vec<(&Record, f64)> = runs.iter().zip(figures.iter().map(|f| f.value)).collect();
         order.sort_by(|a, b| a.1.total_cmp(&b.1));

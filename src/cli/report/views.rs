@@ -121,11 +121,12 @@ pub fn path(runs: &[Record]) -> Option<Drawn> {
         ..Plot::default()
     };
     let ends = |(run, views): &(&Record, &Views)| {
-        let end = |path: &[[f64; 2]]| path.last().map(|[x, z]| format!("{x:.1} to the right and {z:.1} ahead ({unit})"));
+        let end =
+            |path: &[[f64; 2]]| path.last().map(|[x, z]| format!("{x:.1} to the right and {z:.1} ahead ({unit})"));
         let truth = end(&views.true_path).map_or_else(String::new, |truth| format!(", truly {truth}"));
-        let off = views.path_error.map_or_else(String::new, |error| {
-            format!("; {error:.2} m off on average once laid over the true path")
-        });
+        let off = views
+            .path_error
+            .map_or_else(String::new, |error| format!("; {error:.2} m off on average once laid over the true path"));
         format!("{} ends {}{truth}{off}", run.name, end(&views.path).unwrap_or_default())
     };
     let words = format!(

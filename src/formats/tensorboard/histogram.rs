@@ -99,7 +99,10 @@ mod tests {
             assert!(found.bucket[i] > 0.0, "{number} in {found:?}");
             // A bucket that holds a number is no wider than the growth says, but for what lies around 0.
             let below = if i > 0 { found.bucket_limit[i - 1] } else { f64::NEG_INFINITY };
-            assert!(below <= number && (number.abs() < 1e-11 || number > 1e19 || found.bucket_limit[i] - below < 0.11 * number.abs()));
+            assert!(
+                below <= number
+                    && (number.abs() < 1e-11 || number > 1e19 || found.bucket_limit[i] - below < 0.11 * number.abs())
+            );
         }
         assert!((found.sum_squares - numbers[..7].iter().map(|x| f64::from(*x).powi(2)).sum::<f64>()).abs() < 1e50);
     }

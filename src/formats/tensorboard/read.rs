@@ -35,7 +35,10 @@ pub fn read_events(path: &Path) -> Result<EventFile> {
     while !rest.is_empty() {
         let wrong = |what: &str| {
             let (number, at) = (found.events.len(), bytes.len() - rest.len());
-            Error::file(path, format!("frame {number}, at byte {at}: {what}: no event file of TensorBoard, or a damaged one"))
+            Error::file(
+                path,
+                format!("frame {number}, at byte {at}: {what}: no event file of TensorBoard, or a damaged one"),
+            )
         };
         let Some((length, sum)) = rest.split_at_checked(HEAD).map(|(head, _)| head.split_at(8)) else {
             found.torn = true;

@@ -7,8 +7,8 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use prost::Message;
 
-use super::message::{Event, Point, SessionLog, Status, Summary, What};
 use super::checksum;
+use super::message::{Event, Point, SessionLog, Status, Summary, What};
 use crate::{Error, Result};
 
 /// The version that readers take the files for.
