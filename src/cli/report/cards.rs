@@ -11,10 +11,10 @@ pub fn cards(runs: &[Record], album: &mut Album) -> Markup {
     let verdicts: Vec<Verdict> = runs.iter().map(Verdict::of).collect();
     html! {
         @if runs.len() > 1 { p.verdict { (compared(runs, &verdicts).join(" ")) } }
-        div.cards {
+        div class=(if runs.len() > 1 { "cards" } else { "cards one" }) {
             @for (run, verdict) in runs.iter().zip(&verdicts) {
                 section class={ "card " (verdict.standing.class()) } aria-label={ "Verdict on run " (run.name) } {
-                    h2 { (run.name) }
+                    h2 { @if runs.len() > 1 { (run.name) } @else { "How it went" } }
                     p.standing { (verdict.standing.word()) }
                     @if let Some(figure) = verdict.figure {
                         p.figure { strong { (format!("{:.3}", figure.value)) } " " (figure.name) " (" (figure.on) ")" }

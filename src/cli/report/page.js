@@ -27,7 +27,7 @@ const again = document.getElementById("again");
 if (again) {
   again.checked = kept.get("again") !== "off";
   again.addEventListener("change", () => kept.set("again", again.checked ? "on" : "off"));
-  // Never away from under the hands of somebody who is using the page.
+  // Not while the page is being used.
   const used = () => document.hidden || ![null, document.body, again].includes(document.activeElement);
   setInterval(() => { if (again.checked && !used()) location.reload(); }, 1000 * again.dataset.seconds);
 }

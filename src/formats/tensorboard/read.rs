@@ -110,7 +110,8 @@ mod tests {
             fs::write(&other, &bytes[..length]).unwrap();
             let found = read_events(&other).unwrap();
             let ends = found.events.len();
-            assert!(ends < 4 && found.events == whole.events[..ends], "{length}");
+            // As text, where a number that is none equals itself.
+            assert!(ends < 4 && format!("{:?}", found.events) == format!("{:?}", &whole.events[..ends]), "{length}");
         }
         for at in 0..bytes.len() {
             let mut bad = bytes.clone();
