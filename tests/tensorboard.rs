@@ -14,7 +14,7 @@ use parallax::train::rotations::Rotations;
 use parallax::train::run::{Ended, Event, Run, RunData};
 
 fn street(seed: u64) -> Arc<dyn DataSource> {
-    let config = StreetConfig { height: 32, width: 64, sequences: 1, frames: 6, seed, ..StreetConfig::default() };
+    let config = StreetConfig { height: 64, width: 96, sequences: 1, frames: 6, seed, ..StreetConfig::default() };
     Arc::new(Street::render(&config, None))
 }
 
@@ -54,7 +54,7 @@ fn a_run_that_was_killed_and_went_on_has_every_step_once_and_as_its_log_says() {
     let data = RunData { train: street(1), validation: street(2), test: Some(street(3)) };
     let usual = RunConfig::new(Preset::Pico, 4);
     let config =
-        RunConfig { height: 32, width: 64, batch: 2, log_every: 1, checkpoint_every: 2, tensorboard: true, ..usual };
+        RunConfig { height: 64, width: 96, batch: 2, log_every: 1, checkpoint_every: 2, tensorboard: true, ..usual };
     let config = RunConfig { rotations: Rotations::default(), ..config };
 
     // What a killed program leaves: the state of step 2, and events of step 3.
@@ -118,14 +118,14 @@ fn a_run_that_was_killed_and_went_on_has_every_step_once_and_as_its_log_says() {
     }
     let [Worth::Image(depth)] = &found["Depth and its error/error0-depth"][&4][..] else { panic!("no picture") };
     let picture = image::load_from_memory(&depth.encoded).expect("a picture");
-    assert_eq!((depth.width, depth.height), (64, 32));
-    assert_eq!((picture.width(), picture.height()), (64, 32));
+    assert_eq!((depth.width, depth.height), (96, 64));
+    assert_eq!((picture.width(), picture.height()), (96, 64));
 }
 
 #[test]
 fn without_being_asked_for_there_are_no_events() {
     let place = tempfile::tempdir().expect("a folder");
-    let config = RunConfig { height: 32, width: 64, batch: 2, steps: 1, ..RunConfig::new(Preset::Pico, 1) };
+    let config = RunConfig { height: 64, width: 96, batch: 2, steps: 1, ..RunConfig::new(Preset::Pico, 1) };
     let config = RunConfig { rotations: Rotations::default(), ..config };
     let data = RunData { train: street(1), validation: street(2), test: None };
     let ended = Run::create(place.path(), config).expect("a run").train(&data, || false, |_| ()).expect("trained");

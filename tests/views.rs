@@ -13,7 +13,7 @@ use parallax::train::run::{Ended, Run, RunData, is_running};
 use parallax::train::views::{AT_END, AT_VALIDATION, Views, make_views};
 
 fn street(seed: u64) -> Arc<dyn DataSource> {
-    let config = StreetConfig { height: 32, width: 64, sequences: 1, frames: 6, seed, ..StreetConfig::default() };
+    let config = StreetConfig { height: 64, width: 96, sequences: 1, frames: 6, seed, ..StreetConfig::default() };
     Arc::new(Street::render(&config, None))
 }
 
@@ -25,7 +25,7 @@ fn views(folder: &Path, list: &str) -> Views {
 fn lost_views_are_made_from_the_weights_but_not_while_the_run_is_trained() {
     let place = tempfile::tempdir().expect("a folder");
     let folder = place.path();
-    let config = RunConfig { height: 32, width: 64, batch: 2, ..RunConfig::new(Preset::Pico, 2) };
+    let config = RunConfig { height: 64, width: 96, batch: 2, ..RunConfig::new(Preset::Pico, 2) };
     let config = RunConfig { rotations: Rotations::default(), ..config };
     let data = RunData { train: street(1), validation: street(2), test: Some(street(3)) };
     let mut run = Run::create(folder, config).expect("a run");
