@@ -43,6 +43,7 @@ fn log(folder: &Path) -> Vec<serde_json::Value> {
             let fields = line.as_object_mut().expect("an object");
             fields.remove("seconds");
             fields.remove("data_seconds");
+            fields.remove("trained");
             line
         })
         .collect()
@@ -101,6 +102,9 @@ fn a_resumed_run_ends_like_one_that_never_stopped() {
     let expected = ["Attention of query pixels", "Depth and its error", "Warped neighbours and auto-mask"];
     assert!(kinds(&last).iter().eq(expected), "{:?}", kinds(&last));
     assert!(kinds(&end).iter().eq(["Worst samples"]) && end.path.len() > 1 && end.metres, "{end:?}");
+    assert!(end.true_path.len() == end.path.len() && end.path_error.is_some(), "{end:?}");
+    // Streets are driven along: some metres a frame, and forward.
+    assert!(end.true_path.windows(2).all(|pair| pair[1][1] > pair[0][1]), "{end:?}");
     assert!(
         last.step == 5 && last.time.iter().any(|(op, seconds)| op == "conv2d" && *seconds > 0.0),
         "{:?}",

@@ -31,6 +31,7 @@ mod sizes;
 mod stereo;
 mod train;
 mod view;
+mod watch;
 mod weights;
 
 use std::process::ExitCode;

@@ -27,6 +27,7 @@ use super::film::FilmArgs;
 use super::progress::Progress;
 use super::report;
 use super::stereo::StereoArgs;
+use super::watch::Watch;
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -144,6 +145,8 @@ pub struct Args {
     #[command(flatten)]
     control: Control,
     #[command(flatten)]
+    watch: Watch,
+    #[command(flatten)]
     networks: ablation::Networks,
     #[command(flatten)]
     loss: ablation::Loss,
@@ -184,6 +187,7 @@ pub fn run(args: Args) -> Result<()> {
     if let Err(error) = report::record_machine(&place) {
         note!("warning: the machine could not be noted: {error}");
     }
+    args.watch.begin(&place);
     let ended = run.train(
         &data,
         || stop.asked.load(Ordering::SeqCst),
@@ -338,6 +342,7 @@ fn resume(args: &Args, folder: &Path) -> Result<(Run, RunData)> {
         config.skip_bad_frames |= args.skip_bad_frames;
         config.recompute |= args.recompute;
         args.control.apply_kept(config);
+        args.watch.apply(config);
         Ok(())
     };
     let run = Run::resume_with(folder, change, |warning| note!("warning: {warning}"))?;
@@ -507,6 +512,7 @@ fn configuration(args: &Args) -> Result<RunConfig> {
         c.optim.pose_rate *= factor;
     }
     args.control.apply(&mut c)?;
+    args.watch.apply(&mut c);
     Ok(c)
 }
 

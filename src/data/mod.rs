@@ -96,6 +96,12 @@ pub trait DataSource: Send + Sync {
         self.place(sample).sequence.to_string()
     }
 
+    /// Where the camera of a sample's target frame stood, where that is known: the rows `[R | C]` that map points of the camera
+    /// to the frame of the recording, in metres.
+    fn pose(&self, _sample: usize) -> Option<[[f64; 4]; 3]> {
+        None
+    }
+
     /// Ground-truth depth of the target frame at its own size, where there is one.
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>>;
 
@@ -242,6 +248,9 @@ impl DataSource for Subset {
     }
     fn recording(&self, sample: usize) -> String {
         self.data.recording(self.samples[sample])
+    }
+    fn pose(&self, sample: usize) -> Option<[[f64; 4]; 3]> {
+        self.data.pose(self.samples[sample])
     }
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {
         self.data.depth(self.samples[sample])

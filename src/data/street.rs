@@ -71,6 +71,11 @@ impl DataSource for Street {
         self.right_frame(sequence, frame).cloned().ok_or_else(without)
     }
 
+    fn pose(&self, sample: usize) -> Option<[[f64; 4]; 3]> {
+        let (sequence, frame) = self.locate(sample);
+        Some(self.poses(sequence)[frame].matrix())
+    }
+
     fn depth(&self, sample: usize) -> Result<Option<DepthMap>> {
         let (sequence, frame) = self.locate(sample);
         Ok(Some(self.frame_depth(sequence, frame)))

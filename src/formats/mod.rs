@@ -14,6 +14,7 @@
 //! | [`pfm`] | reading disparity as Middlebury stores it |
 //! | [`mat`] | reading an array of a MATLAB 5 file |
 //! | [`ply`] | coloured point clouds |
+//! | [`tensorboard`] | TensorBoard's event files |
 //!
 //! [`TensorFile`] opens any file of named tensors.
 
@@ -35,6 +36,7 @@ pub mod safetensors;
 mod source;
 mod stored;
 mod tensor_file;
+pub mod tensorboard;
 
 pub use stored::{Dtype, StoredTensor};
 pub use tensor_file::TensorFile;

@@ -45,7 +45,7 @@ const APART: u64 = 1_000_000;
 /// # Errors
 /// If the data cannot be read, one frame is in two splits, or there are fewer samples than a batch holds.
 pub fn open(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + Sync)) -> Result<RunData> {
-    let data = if is_rendered(&config.data) { street(config, progress) } else { folder(config)? };
+    let data = if is_rendered(&config.data) { street(config, sequences(config), progress) } else { folder(config)? };
     if data.train.len() < config.batch {
         let message =
             format!("{} samples a batch, but the data holds {}: make it smaller", config.batch, data.train.len());
@@ -84,7 +84,32 @@ pub(super) fn bytes_held(config: &RunConfig) -> f64 {
     each * (frames * config.height * config.width) as f64
 }
 
-fn street(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + Sync)) -> RunData {
+/// Opens (or renders) the samples alone that pictures of a run are made of: those that it reports on, or else validates on.
+///
+/// # Errors
+/// If a folder's data cannot be read.
+pub fn open_shown(
+    config: &RunConfig,
+    progress: &(dyn Fn(&'static str, usize, usize) + Sync),
+) -> Result<Arc<dyn DataSource>> {
+    let [.., test] = sequences(config);
+    let data = match is_rendered(&config.data) {
+        true => street(&RunConfig { endless: false, ..config.clone() }, [0, 0, test], progress),
+        false => folder(config)?,
+    };
+    Ok(data.test.unwrap_or(data.validation))
+}
+
+/// Sequences of rendered data: training, validation, test.
+fn sequences(config: &RunConfig) -> [usize; 3] {
+    if config.data == STREET_2 { WIDE_SEQUENCES } else { SEQUENCES }
+}
+
+fn street(
+    config: &RunConfig,
+    [train, validation, test]: [usize; 3],
+    progress: &(dyn Fn(&'static str, usize, usize) + Sync),
+) -> RunData {
     let RunConfig { height, width, seed, .. } = *config;
     let wide = config.data == STREET_2;
     let settings = |sequences: usize, seed: u64| {
@@ -105,7 +130,6 @@ fn street(config: &RunConfig, progress: &(dyn Fn(&'static str, usize, usize) + S
     let street = |what: &'static str, sequences: usize, seed: u64| {
         Arc::new(Street::render(&settings(sequences, seed), Some(&|done, all| progress(what, done, all))))
     };
-    let [train, validation, test] = if wide { WIDE_SEQUENCES } else { SEQUENCES };
     let train: Arc<dyn DataSource> = match config.endless {
         true => {
             let told = |done, all| progress("street", done, all);

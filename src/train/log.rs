@@ -1,5 +1,5 @@
-//! The logs of a run, lines of JSON: `log.jsonl` has one for each logged step and for each validation, `warnings.jsonl`
-//! one for each warning that begins or ends.
+//! The logs of a run, lines of JSON: `log.jsonl` has one for each logged step, for each validation and for what the run's
+//! page took there, `warnings.jsonl` one for each warning that begins or ends.
 
 use std::fs::{File, OpenOptions};
 use std::io::Write;
@@ -53,7 +53,8 @@ pub(super) fn forget_after(folder: &Path, steps: u64, validated: u64) -> Result<
             // A torn last line is none.
             let Ok(line) = serde_json::from_str::<serde_json::Value>(line) else { return false };
             let number = |field: &str| line[field].as_u64();
-            number("step").is_some_and(|s| s <= steps) || number("validated").is_some_and(|s| s <= validated)
+            let validation = number("validated").or_else(|| number("page"));
+            number("step").is_some_and(|s| s <= steps) || validation.is_some_and(|s| s <= validated)
         };
         let kept: String = text.lines().filter(keep).flat_map(|l| [l, "\n"]).collect();
         write_bytes_atomically(&path, kept.as_bytes())?;
@@ -61,17 +62,32 @@ pub(super) fn forget_after(folder: &Path, steps: u64, validated: u64) -> Result<
     Ok(())
 }
 
-/// Steps of a run's log, oldest first. Lines from before they had all of today's figures are left out.
-pub(super) fn steps(folder: &Path) -> Result<Vec<StepReport>> {
+/// The last logged step of a run; nothing where none is.
+pub(super) fn last_step(folder: &Path) -> Result<Option<u64>> {
+    Ok(lines(folder)?.iter().rev().find_map(|line| line["step"].as_u64()))
+}
+
+/// The step of the last validation that found the best weights so far; nothing where none did.
+pub(super) fn best_step(folder: &Path) -> Result<Option<u64>> {
+    let best = |line: &serde_json::Value| line["validated"].as_u64().filter(|_| line["best"] == true);
+    Ok(lines(folder)?.iter().rev().find_map(best))
+}
+
+/// The lines of a run's log, oldest first, without those that are no JSON; none where there is no log.
+fn lines(folder: &Path) -> Result<Vec<serde_json::Value>> {
     let path = folder.join(LOG);
     if !path.exists() {
         return Ok(Vec::new());
     }
     let text = read_text(&path, MAX_LOG, "the log of a run")?;
-    let step = |line: &str| {
-        let line: serde_json::Value = serde_json::from_str(line).ok()?;
+    Ok(text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect())
+}
+
+/// Steps of a run's log, oldest first. Lines from before they had all of today's figures are left out.
+pub(super) fn steps(folder: &Path) -> Result<Vec<StepReport>> {
+    let step = |line: serde_json::Value| {
         line.get("flow")?;
         serde_json::from_value(line).ok()
     };
-    Ok(text.lines().filter_map(step).collect())
+    Ok(lines(folder)?.into_iter().filter_map(step).collect())
 }

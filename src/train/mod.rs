@@ -14,6 +14,7 @@ pub mod run;
 pub mod schedule;
 pub mod start;
 mod state;
+mod tensorboard;
 pub mod trainer;
 mod validation;
 pub mod views;

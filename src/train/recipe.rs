@@ -210,6 +210,9 @@ pub struct RunConfig {
     pub checkpoint_every: u64,
     /// Number of states that are kept: the newest, and those before it. From 3 on under their steps, too.
     pub keep: usize,
+    /// Whether figures, pictures and histograms are written for TensorBoard, too (`tensorboard/` in the run's folder).
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub tensorboard: bool,
     /// Number of validations in a row without a new best after which training stops; without, it goes to the end.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub patience: Option<u64>,
@@ -286,6 +289,7 @@ impl RunConfig {
             log_every: 10,
             checkpoint_every: 200,
             keep: 2,
+            tensorboard: false,
             patience: None,
             epoch: None,
             freeze: Vec::new(),

@@ -3,33 +3,39 @@
 //! `RUN/config.toml` (all of it, to run it again), `log.jsonl` (a line a logged step and a validation), `warnings.jsonl` (a
 //! line where a warning of [`health`](super::health) begins or ends), `checkpoints/` (the whole state, and the one before
 //! it), `best.safetensors` and `last.safetensors`, `metrics.json`, `images/` (of the last
-//! validation), `pages/` (a few of every validation), `views/` ([`views`](super::views) of the last).
+//! validation), `pages/` (a few of every validation), `views/` ([`views`](super::views) of the last), and if asked for
+//! `tensorboard/`.
 //!
 //! What is computed is never lost: the state is written before anything is measured, and nothing that only concerns
 //! reporting ends a training.
 
-use std::fs::{self, File, TryLockError};
+mod files;
+mod health;
+
+use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
 use serde::Serialize;
 
-use super::health::{Monitor, Warning};
+pub(super) use files::{BEST, CHECKPOINTS, LAST, PAGES, TENSORBOARD, VIEWS, lock};
+use files::{LOCK, write_config};
+pub use files::{is_running, load_weights, write_weights};
+use health::Health;
+
+use super::health::Warning;
 use super::log::{self, Log};
 use super::recipe::{RunConfig, read_config};
 use super::start::Start;
 use super::state::{self, Notes};
+use super::tensorboard::Board;
 use super::trainer::{StepReport, Trainer};
 pub use super::validation::{RunMetrics, Validation};
 use crate::data::DataSource;
 use crate::data::batch::{Batch, Loader, SkipList};
 use crate::error::{Error, Result};
-use crate::formats::atomic::{self, check_writable, write_bytes_atomically};
-use crate::formats::safetensors;
-use crate::networks::{DepthNetwork, Setup};
-use crate::nn::Params;
-use crate::weights::{self, Need, Weights};
+use crate::formats::atomic::{self, check_writable};
 
 /// The samples that a run trains on, validates on and reports on. None is in two of them.
 pub struct RunData {
@@ -87,6 +93,8 @@ pub struct Run {
     pub(super) trainer: Trainer,
     pub(super) notes: Notes,
     pub(super) skipped: SkipList,
+    /// TensorBoard's events, while they are written.
+    pub(super) board: Option<Board>,
     /// Held while this process has the run.
     _lock: File,
 }
@@ -135,6 +143,7 @@ impl Run {
             trainer,
             notes: Notes::default(),
             skipped: SkipList::default(),
+            board: None,
             _lock: lock,
         };
         run.save()?;
@@ -177,7 +186,8 @@ impl Run {
             write_config(folder, &config)?;
         }
         log::forget_after(folder, trainer.steps(), notes.validated)?;
-        Ok(Run { folder: folder.to_owned(), config, trainer, notes, skipped: SkipList::default(), _lock: lock })
+        let skipped = SkipList::default();
+        Ok(Run { folder: folder.to_owned(), config, trainer, notes, skipped, board: None, _lock: lock })
     }
 
     /// Steps done.
@@ -208,6 +218,7 @@ impl Run {
         let validation = self.validation_batches(data, &mut tell);
         let mut log = Log::open(&self.folder, log::LOG)?;
         let mut health = Health::open(&self.folder)?;
+        self.open_board(&mut tell);
         if !self.learn_rotations(data, &stop, &mut tell)? {
             // The state on disk is that before the first of these steps: they will be taken again.
             return Ok(Ended::Interrupted(0));
@@ -226,7 +237,7 @@ impl Run {
             let next: Result<Vec<Batch>> = (0..accumulate).map(|_| loader.next_batch()).collect();
             let report = match next.and_then(|batches| {
                 waited += asked.elapsed().as_secs_f64();
-                self.trainer.step_of(&batches)
+                self.step_of(&batches)
             }) {
                 Ok(report) => report,
                 Err(error) => {
@@ -244,6 +255,7 @@ impl Run {
                 let n = f64::from(counted);
                 let (seconds, data_seconds) = (since.elapsed().as_secs_f64() / n, waited / n);
                 log.write(&StepLine { step: report, seconds, data_seconds })?;
+                self.board_gets(|board, _| board.step(&report, [seconds, data_seconds]), &mut tell);
                 health.see(&report, &mut tell)?;
                 self.notes.seconds += since.elapsed().as_secs_f64();
                 (since, waited, counted) = (Instant::now(), 0.0, 0);
@@ -266,7 +278,18 @@ impl Run {
         if self.trainer.steps() < self.config.steps {
             tell(Event::Phase(&format!("stopping: no new best in {} validations", self.notes.since_best)));
         }
-        Ok(Ended::Finished(Box::new(self.finish(data, mean_map, &mut tell)?)))
+        Ok(Ended::Finished(Box::new(self.finish(data, mean_map, &mut log, &mut tell)?)))
+    }
+
+    /// Takes a step; where its weights are validated next, TensorBoard gets its gradients.
+    fn step_of(&mut self, batches: &[Batch]) -> Result<StepReport> {
+        let watched = self.validates_after(self.trainer.steps() + 1);
+        let board = self.board.as_mut().filter(|_| watched);
+        self.trainer.step_watched(batches, |trainer, gradients| {
+            if let Some(board) = board {
+                board.see_gradients(trainer, gradients);
+            }
+        })
     }
 
     /// Whether validation has found no new best for as long as the configuration waits.
@@ -276,8 +299,12 @@ impl Run {
 
     /// Whether the state is written after the step that was taken last.
     fn checkpoint_is_due(&self) -> bool {
-        let steps = self.trainer.steps();
-        steps.is_multiple_of(self.config.checkpoint_every) || steps == self.config.steps
+        self.validates_after(self.trainer.steps())
+    }
+
+    /// Whether the state is written, and its weights are validated, after a step.
+    fn validates_after(&self, step: u64) -> bool {
+        step.is_multiple_of(self.config.checkpoint_every) || step == self.config.steps
     }
 
     /// Whether a checkpoint's weights have not been validated: the run stopped in between.
@@ -325,72 +352,4 @@ impl Run {
         let weights = self.trainer.weights();
         write_weights(&self.folder.join(BEST), &weights, &self.config.setup())
     }
-}
-
-/// The monitor of a run, and where it writes to.
-struct Health {
-    monitor: Monitor,
-    log: Log,
-}
-
-impl Health {
-    /// A monitor that has seen what the run has logged already.
-    fn open(folder: &Path) -> Result<Self> {
-        let mut monitor = Monitor::default();
-        log::steps(folder)?.iter().for_each(|step| drop(monitor.see(step)));
-        Ok(Health { monitor, log: Log::open(folder, log::WARNINGS)? })
-    }
-
-    fn see(&mut self, step: &StepReport, tell: &mut impl FnMut(Event)) -> Result<()> {
-        for warning in self.monitor.see(step) {
-            self.log.write(&warning)?;
-            if warning.first {
-                tell(Event::Health(&warning));
-            }
-        }
-        Ok(())
-    }
-}
-
-/// The file of the weights that validation chose.
-pub(super) const BEST: &str = "best.safetensors";
-/// The file of the weights that training ended with.
-pub(super) const LAST: &str = "last.safetensors";
-/// The folder of states.
-pub(super) const CHECKPOINTS: &str = "checkpoints";
-/// The folder of pictures as training goes on, `STEP-SAMPLE.jpg`.
-pub(super) const PAGES: &str = "pages";
-/// The folder of [`views`](super::views).
-pub(super) const VIEWS: &str = "views";
-const LOCK: &str = ".lock";
-
-/// Takes the run for this process, until the file is closed, be it by a crash.
-fn lock(folder: &Path) -> Result<File> {
-    let path = folder.join(LOCK);
-    let file = File::create(&path).map_err(|e| Error::io(&path, e))?;
-    match file.try_lock() {
-        Ok(()) => Ok(file),
-        Err(TryLockError::WouldBlock) => {
-            Err(Error::file(folder, "another process is training this run: wait for it, or give another folder"))
-        }
-        // Some network file systems have no locks: better a run without one than none.
-        Err(TryLockError::Error(e)) if e.kind() == std::io::ErrorKind::Unsupported => Ok(file),
-        Err(TryLockError::Error(e)) => Err(Error::io(&path, e)),
-    }
-}
-
-fn write_config(folder: &Path, config: &RunConfig) -> Result<()> {
-    let text = toml::to_string(config).map_err(|e| Error::Failed(format!("the configuration: {e}")))?;
-    write_bytes_atomically(folder.join("config.toml"), text.as_bytes())
-}
-
-/// Writes weights for use: PyTorch's names and layouts, their setup in the metadata.
-pub fn write_weights(path: &Path, params: &Params<f32>, setup: &Setup) -> Result<()> {
-    safetensors::write(path, &params.export(), setup.metadata()?)
-}
-
-/// Reads weights to predict depth with: a run's folder, or a file or folder of any kind that [`weights::load`] reads.
-pub fn load_weights(path: &Path) -> Result<(DepthNetwork, Params<f32>, Setup)> {
-    let Weights { model, params, setup, .. } = weights::load(&[path.to_owned()], Need::Depth, false)?;
-    Ok((model, params, setup))
 }

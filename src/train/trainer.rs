@@ -1,8 +1,10 @@
 //! One training step, and the state that it moves.
 
+mod report;
+
 use std::collections::HashMap;
 
-use serde::{Deserialize, Serialize};
+pub use report::StepReport;
 
 use super::freeze::{Frozen, frozen};
 use super::recipe::Plan;
@@ -18,63 +20,6 @@ use crate::random::{Random, Stream};
 use crate::tensor::profile;
 use crate::tensor::{Tape, Tensor, Var};
 
-/// The figures of a step.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct StepReport {
-    /// The step, from 1.
-    pub step: u64,
-    /// The total loss.
-    pub loss: f64,
-    /// The per-pixel minimum of photometric errors.
-    pub photometric: f64,
-    /// The same over warped neighbours alone.
-    pub warped: f64,
-    /// The same over unwarped neighbours alone.
-    pub unwarped: f64,
-    /// The smoothness term, weighted.
-    pub smoothness: f64,
-    /// The share of pixels that auto-masking leaves in.
-    pub auto_mask: f64,
-    /// The distance to known depth, not weighted; 0 where there is no such supervision.
-    #[serde(default)]
-    pub depth_error: f64,
-    /// The learning rates: encoder, decoder, pose networks.
-    pub learning_rates: [f64; 3],
-    /// The norm of all gradients, before clipping.
-    pub grad_norm: f64,
-    /// The norms of the gradients of the encoder, the decoder and the pose networks, before clipping.
-    #[serde(default)]
-    pub grad_norms: [f64; 3],
-    /// Figures of the networks' predictions.
-    #[serde(default, flatten)]
-    pub vitals: Vitals,
-}
-
-impl StepReport {
-    /// The means of what batches show; step, rates and gradients stay empty.
-    fn mean(of: &[StepReport]) -> StepReport {
-        let mean = |figure: fn(&StepReport) -> f64| of.iter().map(figure).sum::<f64>() / of.len().max(1) as f64;
-        StepReport {
-            loss: mean(|r| r.loss),
-            photometric: mean(|r| r.photometric),
-            warped: mean(|r| r.warped),
-            unwarped: mean(|r| r.unwarped),
-            smoothness: mean(|r| r.smoothness),
-            auto_mask: mean(|r| r.auto_mask),
-            depth_error: mean(|r| r.depth_error),
-            vitals: Vitals {
-                disparity: mean(|r| r.vitals.disparity),
-                disparity_spread: mean(|r| r.vitals.disparity_spread),
-                saturated: mean(|r| r.vitals.saturated),
-                translation: mean(|r| r.vitals.translation),
-                flow: mean(|r| r.vitals.flow),
-                inside: mean(|r| r.vitals.inside),
-            },
-            ..StepReport::default()
-        }
-    }
-}
-
 /// A model in training.
 pub struct Trainer {
     /// The networks.
@@ -86,7 +31,7 @@ pub struct Trainer {
     pub(super) average: Option<Average<f32>>,
     ties: TieBreak<f32>,
     /// The part that each parameter belongs to.
-    parts: Vec<usize>,
+    pub(super) parts: Vec<usize>,
     frozen: Frozen,
 }
 
@@ -272,6 +217,15 @@ impl Trainer {
     /// # Panics
     /// If there is no batch.
     pub fn step_of(&mut self, batches: &[Batch]) -> Result<StepReport> {
+        self.step_watched(batches, |_, _| ())
+    }
+
+    /// [`step_of`](Trainer::step_of), of which `watch` sees the gradients, parameter by parameter, as the optimiser gets them.
+    pub(super) fn step_watched(
+        &mut self,
+        batches: &[Batch],
+        watch: impl FnOnce(&Self, &[Option<Tensor<f32>>]),
+    ) -> Result<StepReport> {
         let step = self.adamw.steps + 1;
         let mut sum: Vec<Option<Tensor<f32>>> = Vec::new();
         let mut reports = Vec::new();
@@ -293,6 +247,7 @@ impl Trainer {
             scale(&mut sum, 1.0 / batches.len() as f64);
         }
         let (grad_norms, grad_norm) = self.clip(&mut sum, &reports)?;
+        watch(self, &sum);
         let factor = self.plan.schedule.factor(step);
         let learning_rates =
             [self.plan.optim.encoder_rate, self.plan.optim.rate, self.plan.optim.pose_rate].map(|r| r * factor);

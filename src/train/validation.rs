@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::path::Path;
+use std::time::Instant;
 
 use image::codecs::jpeg::JpegEncoder;
 use serde::{Deserialize, Serialize};
@@ -63,6 +64,17 @@ pub struct Validation {
     pub a1: Option<f64>,
 }
 
+/// The time that a run's page took at a validation or at the end, a line of the log.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+struct PageLine {
+    /// The step after which the weights were shown.
+    page: u64,
+    /// Pictures, views, and whoever is told of the validation and writes the page, in seconds.
+    seconds: f64,
+    /// The training loop so far, in seconds.
+    trained: f64,
+}
+
 /// How many pictures of every validation are kept.
 const KEPT: usize = 3;
 /// How a run measures depth: every pixel with ground truth, at the truth's median.
@@ -117,6 +129,7 @@ impl Run {
         tell: &mut impl FnMut(Event),
     ) -> Result<()> {
         let step = self.trainer.steps();
+        let mut seen = None;
         if !batches.is_empty() {
             let weights = self.trainer.weights();
             let [photometric, warped, unwarped] = self.trainer.validate(&weights, batches);
@@ -138,23 +151,37 @@ impl Run {
             let (abs_rel, a1) = (metrics.map(|m| m.abs_rel), metrics.map(|m| m.a1));
             let line = Validation { validated: step, photometric, warped, unwarped, best, abs_rel, a1 };
             log.write(&line)?;
+            let began = Instant::now();
             let shown = data.test.as_deref().unwrap_or(data.validation.as_ref());
             told("pictures", write_images(&self.folder, &predictor, shown, Some(step)), tell);
             let setup = self.config.setup();
-            let shown = Shown { model: &self.trainer.model, params: &weights, setup, data: shown };
-            told("views of the weights", self.view_validation(&shown, &batches[0]), tell);
+            let shown = Shown { model: &self.trainer.model, params: &weights, setup, data: shown, step };
+            let views = told("views of the weights", self.view_validation(&shown, &batches[0]), tell);
             // Whoever hears of it finds the pictures there.
             tell(Event::Validated(&line));
+            log.write(&self.page_line(began))?;
+            seen = Some((line, weights, views.unwrap_or_default()));
         }
         self.notes.validated = step;
-        self.notes.write(&self.folder, step)
+        self.notes.write(&self.folder, step)?;
+        // After the note: what a run that is killed here has not written yet is missing there, and never doubled.
+        if let Some((line, weights, views)) = seen {
+            self.board_gets(|board, run| board.validation(run, &line, &weights, &views), tell);
+        }
+        Ok(())
+    }
+
+    /// The time since the run began to make what its page shows.
+    fn page_line(&self, began: Instant) -> PageLine {
+        PageLine { page: self.trainer.steps(), seconds: began.elapsed().as_secs_f64(), trained: self.notes.seconds }
     }
 
     /// Measures the best weights, and writes pictures and `metrics.json`.
     pub(super) fn finish(
-        &self,
+        &mut self,
         data: &RunData,
         mean_map: Option<Metrics>,
+        log: &mut Log,
         tell: &mut impl FnMut(Event),
     ) -> Result<RunMetrics> {
         tell(Event::Phase("measuring the best weights"));
@@ -166,13 +193,18 @@ impl Run {
         let (model, params, setup) = load_weights(&best)?;
         let predictor = Predictor::new(&model, &params, &setup);
         let shown = data.test.as_deref().unwrap_or(data.validation.as_ref());
+        let began = Instant::now();
         told("pictures", write_images(&self.folder, &predictor, shown, None), tell);
+        let mut page = self.page_line(began);
         let report = data.test.as_deref().and_then(|test| {
             let samples: Vec<usize> = (0..test.len()).collect();
             told("the best weights", evaluate(&predictor, test, &samples, DENSE, |_| ()), tell)
         });
-        let shown = Shown { model: &model, params: &params, setup, data: shown };
+        let began = Instant::now();
+        let shown = Shown { model: &model, params: &params, setup, data: shown, step: self.trainer.steps() };
         told("views of the best weights", self.view_end(&shown, report.as_ref()), tell);
+        page.seconds += began.elapsed().as_secs_f64();
+        log.write(&page)?;
         let images = report.as_ref().map_or(0, |r| r.images);
         let first = report.as_ref().and_then(|r| r.per_image.first()).map(|image| image.name.as_str());
         let metrics = RunMetrics {
@@ -188,6 +220,7 @@ impl Run {
         };
         let text = serde_json::to_string_pretty(&metrics).map_err(|e| Error::Failed(format!("the metrics: {e}")))?;
         write_bytes_atomically(self.folder.join("metrics.json"), text.as_bytes())?;
+        self.board_gets(|board, run| board.end(run.trainer.steps(), &metrics), tell);
         Ok(metrics)
     }
 }

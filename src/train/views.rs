@@ -4,28 +4,31 @@
 //! They lie in `views/`, with two lists of them: `validation.json` (written at validations) and `end.json`.
 
 mod kinds;
+mod late;
+mod path;
 mod place;
+mod warps;
 
 use std::collections::BTreeMap;
 
-use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
-use kinds::{attention_group, error_group, path};
+use kinds::{attention_group, error_group};
+pub use late::make_views;
+use path::path;
 use place::Place;
+use warps::warps;
 
+use super::recipe::RunConfig;
 use super::run::Run;
-use super::trainer::transforms;
 use crate::data::DataSource;
-use crate::data::batch::{Batch, to_images};
+use crate::data::batch::Batch;
 use crate::error::Result;
 use crate::eval::metrics::Report;
 use crate::eval::predictor::Predictor;
-use crate::monovit::loss::{Reprojection, photometric};
 use crate::networks::{DepthNetwork, Setup};
-use crate::nn::{Context, Params};
-use crate::report::map::{UNKNOWN, draw_map};
-use crate::tensor::{Tensor, Var, profile};
+use crate::nn::Params;
+use crate::tensor::profile;
 
 /// The list that validations write.
 pub const AT_VALIDATION: &str = "validation.json";
@@ -34,6 +37,7 @@ pub const AT_END: &str = "end.json";
 
 /// How many samples are shown of a kind.
 const SAMPLES: usize = 2;
+
 /// A list of views.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
@@ -46,6 +50,11 @@ pub struct Views {
     pub time: Vec<(String, f64)>,
     /// The camera from above: x (right) and z (forward) of every frame, relative to the first.
     pub path: Vec<[f64; 2]>,
+    /// The way that the camera really went, likewise, in metres; empty where that is not known.
+    pub true_path: Vec<[f64; 2]>,
+    /// The root of the mean squared distance between both, in metres, once the one is laid over the other as well as it can
+    /// be; nothing where the true one is not known, or either does not move.
+    pub path_error: Option<f64>,
     /// Whether the path is in metres, otherwise in the unit of predicted depth.
     pub metres: bool,
 }
@@ -80,98 +89,58 @@ pub(super) struct Shown<'a> {
     pub params: &'a Params<f32>,
     pub setup: Setup,
     pub data: &'a dyn DataSource,
+    /// The step of the weights.
+    pub step: u64,
 }
 
-impl Run {
-    /// Leaves the views of a validation.
-    pub(super) fn view_validation(&self, shown: &Shown, batch: &Batch) -> Result<()> {
-        let place = Place::of(&self.folder)?;
-        let predictor = Predictor::new(shown.model, shown.params, &shown.setup);
+impl Shown<'_> {
+    /// The views of a validation, without the time of a step; warped neighbours are those of a batch's first sample.
+    fn of_validation(&self, place: &Place, config: &RunConfig, batch: &Batch) -> Result<Views> {
+        let predictor = Predictor::new(self.model, self.params, &self.setup);
         let mut groups = Vec::new();
-        for i in 0..SAMPLES.min(shown.data.len()) {
-            let sample = i * shown.data.len() / SAMPLES;
-            groups.extend(error_group(
-                &place,
-                &predictor,
-                shown.data,
-                sample,
-                &format!("error{i}"),
-                "Depth and its error",
-            )?);
+        for i in 0..SAMPLES.min(self.data.len()) {
+            let sample = i * self.data.len() / SAMPLES;
+            let name = format!("error{i}");
+            groups.extend(error_group(place, &predictor, self.data, sample, &name, "Depth and its error")?);
         }
-        groups.extend(self.warps(&place, shown, batch)?);
-        groups.extend(attention_group(&place, shown)?);
-        let time = match place.read(AT_VALIDATION) {
-            Some(before) if !before.time.is_empty() => before.time,
-            _ => self.time_by_op(batch)?,
-        };
-        place.write(AT_VALIDATION, &Views { step: self.trainer.steps(), groups, time, ..Views::default() })
+        groups.extend(warps(place, self, config.loss, batch)?);
+        groups.extend(attention_group(place, self)?);
+        Ok(Views { step: self.step, groups, ..Views::default() })
     }
 
-    /// Leaves the views of the end: the camera's path, and the samples with the greatest errors.
-    pub(super) fn view_end(&self, shown: &Shown, report: Option<&Report>) -> Result<()> {
-        let place = Place::of(&self.folder)?;
-        let predictor = Predictor::new(shown.model, shown.params, &shown.setup);
+    /// The views of the end: the camera's path, and the samples of a report with the greatest errors.
+    fn of_end(&self, place: &Place, config: &RunConfig, report: Option<&Report>) -> Result<Views> {
+        let predictor = Predictor::new(self.model, self.params, &self.setup);
         let mut worst: Vec<_> = report.map_or(Vec::new(), |report| report.per_image.iter().collect());
         worst.sort_by(|a, b| b.metrics.abs_rel.total_cmp(&a.metrics.abs_rel));
         let mut groups = Vec::new();
         for (i, image) in worst.iter().take(3).enumerate() {
-            let Some(sample) = (0..shown.data.len()).find(|&s| shown.data.name(s) == image.name) else { continue };
-            groups.extend(error_group(&place, &predictor, shown.data, sample, &format!("worst{i}"), "Worst samples")?);
+            let Some(sample) = (0..self.data.len()).find(|&s| self.data.name(s) == image.name) else { continue };
+            groups.extend(error_group(place, &predictor, self.data, sample, &format!("worst{i}"), "Worst samples")?);
         }
+        let views = Views { step: self.step, groups, ..Views::default() };
         let scale = report.and_then(|report| report.ratio_median);
-        let path = if self.config.sources.in_time() { path(shown, scale.unwrap_or(1.0))? } else { Vec::new() };
-        place.write(
-            AT_END,
-            &Views { step: self.trainer.steps(), groups, path, metres: scale.is_some(), ..Views::default() },
-        )
+        if config.sources.in_time() { path(self, scale, views) } else { Ok(views) }
+    }
+}
+
+impl Run {
+    /// Leaves the views of a validation.
+    pub(super) fn view_validation(&self, shown: &Shown, batch: &Batch) -> Result<Views> {
+        let place = Place::of(&self.folder)?;
+        let mut views = shown.of_validation(&place, &self.config, batch)?;
+        views.time = match place.read(AT_VALIDATION) {
+            Some(before) if !before.time.is_empty() => before.time,
+            _ => self.time_by_op(batch)?,
+        };
+        place.write(AT_VALIDATION, &views)?;
+        Ok(views)
     }
 
-    /// The neighbours of a batch's first sample, warped into its target, and the pixels that auto-masking leaves in.
-    fn warps(&self, place: &Place, shown: &Shown, batch: &Batch) -> Result<Option<Group>> {
-        let (c, config) = (Context::inference(shown.params), self.config.loss);
-        let target = Var::constant(batch.target.clone());
-        let disparity = shown.model.disparities(&c, &target).swap_remove(0);
-        let depth = disparity.disparity_to_depth(config.min_depth, config.max_depth);
-        let plain = Var::constant(batch.pyramid[0].clone());
-        let mut views = vec![place.photo("warp-target", "Target", &to_images(&batch.pyramid[0])[0])?];
-        let (mut moved, mut still) = (Vec::new(), Vec::new());
-        for (i, transform) in transforms(shown.model, &c, batch, &target).iter().enumerate() {
-            let source = Var::constant(batch.sources[i].clone());
-            let warped = source.warp(&depth, transform, &batch.intrinsics, config.consistent_grid);
-            let title = format!("Source {}", i + 1);
-            views.push(place.photo(&format!("warp-source{i}"), &title, &to_images(&batch.sources[i])[0])?);
-            let picture = &to_images(warped.value())[0];
-            views.push(place.photo(&format!("warp-warped{i}"), &format!("{title}, warped"), picture)?);
-            moved.push(photometric(&warped, &plain, &config).into_value());
-            still.push(photometric(&source, &plain, &config).into_value());
-        }
-        let picture = &to_images(&batch.pyramid[0])[0];
-        let (w, h) = picture.dimensions();
-        let pixels = (w * h) as usize;
-        let least = |maps: &[Tensor<f32>], i: usize| {
-            let errors = maps.iter().map(|map| map.data()[i]);
-            if config.reprojection == Reprojection::Minimum {
-                errors.fold(f32::INFINITY, f32::min)
-            } else {
-                errors.sum::<f32>() / maps.len().max(1) as f32
-            }
-        };
-        if moved.is_empty() {
-            return Ok(None);
-        }
-        let errors: Vec<f64> = (0..pixels).map(|i| f64::from(least(&moved, i))).collect();
-        let map = draw_map(&errors, (h as usize, w as usize), (w, h), [0.0, 0.3]);
-        views.push(place.map("warp-error", "Photometric error, warped", &map, ["0".into(), "0.3".into()])?);
-        let kept: Vec<bool> = (0..pixels).map(|i| least(&moved, i) < least(&still, i)).collect();
-        let share = kept.iter().filter(|kept| **kept).count() as f64 / pixels as f64;
-        let mask = RgbImage::from_fn(w, h, |x, y| match kept[(y * w + x) as usize] {
-            true => *picture.get_pixel(x, y),
-            false => UNKNOWN,
-        });
-        let title = format!("Auto-mask: {:.0} % of the pixels are left in, the others grey", 100.0 * share);
-        views.push(place.picture("warp-mask", &title, &mask)?);
-        Ok(Some(Group { kind: "Warped neighbours and auto-mask".into(), about: "a validation sample".into(), views }))
+    /// Leaves the views of the end.
+    pub(super) fn view_end(&self, shown: &Shown, report: Option<&Report>) -> Result<()> {
+        let place = Place::of(&self.folder)?;
+        place.write(AT_END, &shown.of_end(&place, &self.config, report)?)
     }
 
     /// The time of a step's ops and other parts, forward and backward; no weight is changed.

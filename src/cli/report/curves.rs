@@ -34,7 +34,7 @@ struct Chart {
     series: &'static [Series],
 }
 
-const CHARTS: [Chart; 11] = [
+const CHARTS: [Chart; 10] = [
     Chart {
         title: "Loss",
         unit: "error",
@@ -60,14 +60,17 @@ const CHARTS: [Chart; 11] = [
         log: false,
         series: &[step("training", "/disparity_spread")],
     },
-    Chart { title: "Auto-mask share", unit: "pixels left in", log: false, series: &[step("training", "/auto_mask")] },
-    Chart { title: "Motion of warped samples", unit: "pixels", log: false, series: &[step("median", "/flow")] },
     Chart {
-        title: "Warped samples inside the source",
+        title: "Shares of pixels",
         unit: "share",
         log: false,
-        series: &[step("training", "/inside")],
+        series: &[
+            step("left in by auto-masking", "/auto_mask"),
+            step("warped to inside the source", "/inside"),
+            step("disparity at an end of the sigmoid", "/saturated"),
+        ],
     },
+    Chart { title: "Motion of warped samples", unit: "pixels", log: false, series: &[step("median", "/flow")] },
     Chart {
         title: "Gradient norms",
         unit: "log10 of the norm",

@@ -1,15 +1,16 @@
 //! A run's folder as the page shows it: everything that can be read of it, and a word about everything that cannot.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
-use parallax::formats::bounded::{MAX_SETTINGS, read_bounded};
+use parallax::formats::bounded::read_bounded;
+use parallax::train::run::is_running;
 use parallax::train::views::{AT_END, AT_VALIDATION, Views};
 use parallax::{Error, Result};
 use serde_json::Value;
 
-/// Some million lines.
-const MAX_LOG: u64 = 1 << 30;
+use super::gaps::{self, Gap};
+use super::reading::{config, files, json, lines, views};
+
 /// The most bytes of a picture that is shown.
 const MAX_PICTURE: u64 = 1 << 24;
 
@@ -17,10 +18,14 @@ const MAX_PICTURE: u64 = 1 << 24;
 pub struct Record {
     /// The last part of the folder's path; the others may name a user.
     pub name: String,
+    /// Whether it is being trained now.
+    pub running: bool,
     /// Logged steps, oldest first.
     pub steps: Vec<Value>,
     /// Validations, oldest first.
     pub validations: Vec<Value>,
+    /// Lines of the log on the time that its page took.
+    pub pages: Vec<Value>,
     /// Lines of `warnings.jsonl`.
     pub warnings: Vec<Value>,
     /// Names and values of the configuration.
@@ -39,6 +44,8 @@ pub struct Record {
     place: PathBuf,
     /// Things that could not be read, in words.
     pub problems: Vec<String>,
+    /// Things that are not there, and how to get them.
+    pub gaps: Vec<Gap>,
 }
 
 impl Record {
@@ -47,33 +54,43 @@ impl Record {
     /// # Errors
     /// If it holds neither a log nor a configuration of a run.
     pub fn read(folder: &Path) -> Result<Self> {
+        Self::read_as(folder, is_running(folder))
+    }
+
+    /// Reads a folder of which is known whether it is being trained.
+    ///
+    /// # Errors
+    /// As [`read`](Record::read).
+    pub fn read_as(folder: &Path, running: bool) -> Result<Self> {
         if !folder.join("log.jsonl").is_file() && !folder.join("config.toml").is_file() {
             let message =
                 "holds no run: expected log.jsonl or config.toml in it. Give a folder that `parallax train` made";
             return Err(Error::file(folder, message));
         }
         let mut problems = Vec::new();
-        let log = lines(folder, "log.jsonl", &mut problems);
-        let warnings = lines(folder, "warnings.jsonl", &mut problems);
-        let (steps, rest): (Vec<_>, Vec<_>) = log.into_iter().partition(|line| line["step"].is_u64());
-        let validations: Vec<_> = rest.into_iter().filter(|line| line["validated"].is_u64()).collect();
-        if steps.last().is_some_and(|line| line.get("flow").is_none()) {
-            problems.push("the log is of an older version: figures it lacks are left out".into());
-        }
-        Ok(Record {
+        let problems = &mut problems;
+        let log = lines(folder, "log.jsonl", problems);
+        let of = |field: &str| log.iter().filter(|line| line[field].is_u64()).cloned().collect::<Vec<_>>();
+        let mut record = Record {
             name: name_of(folder),
-            config: config(folder, &mut problems),
-            metrics: json(folder, "metrics.json", &mut problems),
-            machine: json(folder, "machine.json", &mut problems),
-            pictures: files(&folder.join("images")).into_iter().filter(|p| has_ending(p, "png")).collect(),
-            views: [AT_VALIDATION, AT_END].into_iter().filter_map(|list| views(folder, list, &mut problems)).collect(),
+            running,
+            steps: of("step"),
+            validations: of("validated"),
+            pages: of("page"),
+            warnings: lines(folder, "warnings.jsonl", problems),
+            config: config(folder, problems),
+            metrics: json(folder, "metrics.json", problems),
+            machine: json(folder, "machine.json", problems),
+            pictures: files(&folder.join("images"), "png"),
+            views: [AT_VALIDATION, AT_END].into_iter().filter_map(|list| views(folder, list, problems)).collect(),
             place: folder.join("views"),
-            snapshots: files(&folder.join("pages")).into_iter().filter_map(snapshot).collect(),
-            steps,
-            validations,
-            warnings,
-            problems,
-        })
+            snapshots: files(&folder.join("pages"), "jpg").into_iter().filter_map(snapshot).collect(),
+            problems: Vec::new(),
+            gaps: Vec::new(),
+        };
+        record.problems.append(problems);
+        record.gaps = gaps::of(folder, &record);
+        Ok(record)
     }
 
     /// The file of a view: never one outside the folder of views, whatever the list says.
@@ -108,6 +125,13 @@ impl Record {
         }
         names
     }
+
+    /// The seconds that its pages and pictures have taken, and those of the training loop until then.
+    pub fn page_time(&self) -> Option<[f64; 2]> {
+        let trained = self.pages.last()?["trained"].as_f64()?;
+        let taken: f64 = self.pages.iter().filter_map(|line| line["seconds"].as_f64()).sum();
+        (trained > 0.0).then_some([taken, trained])
+    }
 }
 
 /// The bytes of a picture that is not too large to be shown.
@@ -120,108 +144,9 @@ fn name_of(folder: &Path) -> String {
     whole.file_name().map_or_else(|| "run".into(), |name| name.to_string_lossy().into_owned())
 }
 
-fn has_ending(path: &Path, ending: &str) -> bool {
-    path.extension().is_some_and(|e| e == ending)
-}
-
-/// The files of a folder by their names; none where there is no folder.
-fn files(folder: &Path) -> Vec<PathBuf> {
-    let mut found: Vec<PathBuf> = fs::read_dir(folder).into_iter().flatten().flatten().map(|e| e.path()).collect();
-    found.sort();
-    found
-}
-
 /// `pages/0000200-1.jpg`: the step and the sample.
 fn snapshot(path: PathBuf) -> Option<(u64, usize, PathBuf)> {
     let (step, sample) = path.file_stem()?.to_str()?.split_once('-')?;
     let found = (step.parse().ok()?, sample.parse().ok()?);
-    has_ending(&path, "jpg").then_some((found.0, found.1, path))
-}
-
-/// Lines of JSON; what is none is counted among the problems.
-fn lines(folder: &Path, name: &str, problems: &mut Vec<String>) -> Vec<Value> {
-    let path = folder.join(name);
-    if !path.exists() {
-        problems.push(format!("there is no {name}: what it would show is left out"));
-        return Vec::new();
-    }
-    let Ok(bytes) = read_bounded(&path, MAX_LOG, "the log of a run") else {
-        problems.push(format!("{name} cannot be read: what it would show is left out"));
-        return Vec::new();
-    };
-    let text = String::from_utf8_lossy(&bytes);
-    let all: Vec<&str> = text.lines().filter(|line| !line.trim().is_empty()).collect();
-    let parsed: Vec<Option<Value>> =
-        all.iter().map(|line| serde_json::from_str(line).ok().filter(Value::is_object)).collect();
-    let bad = parsed.iter().filter(|line| line.is_none()).count();
-    if bad == 1 && parsed.last().is_some_and(Option::is_none) {
-        problems.push(format!("the last line of {name} is torn and left out"));
-    } else if bad > 0 {
-        problems.push(format!("{bad} lines of {name} are no JSON objects and left out"));
-    }
-    parsed.into_iter().flatten().collect()
-}
-
-fn json(folder: &Path, name: &str, problems: &mut Vec<String>) -> Value {
-    let path = folder.join(name);
-    if !path.exists() {
-        return Value::Null;
-    }
-    let read = read_bounded(&path, MAX_SETTINGS, "figures of a run").ok();
-    read.and_then(|bytes| serde_json::from_slice(&bytes).ok()).unwrap_or_else(|| {
-        problems.push(format!("{name} cannot be read and is left out"));
-        Value::Null
-    })
-}
-
-/// A list of views; `None` where there is none, which is told only if it cannot be read.
-fn views(folder: &Path, list: &'static str, problems: &mut Vec<String>) -> Option<(&'static str, Views)> {
-    match json(folder, &format!("views/{list}"), problems) {
-        Value::Null => None,
-        found => {
-            let views = serde_json::from_value(found).ok().map(|views| (list, views));
-            if views.is_none() {
-                problems.push(format!("views/{list} is none of this version's and is left out"));
-            }
-            views
-        }
-    }
-}
-
-fn config(folder: &Path, problems: &mut Vec<String>) -> Vec<(String, String)> {
-    let read = read_bounded(&folder.join("config.toml"), MAX_SETTINGS, "a configuration").ok();
-    let table = read.and_then(|bytes| toml::from_str::<toml::Table>(&String::from_utf8_lossy(&bytes)).ok());
-    let Some(table) = table else {
-        problems.push("config.toml cannot be read: the configuration is left out".into());
-        return Vec::new();
-    };
-    let mut found = Vec::new();
-    flatten("", &toml::Value::Table(table), &mut found);
-    found
-}
-
-/// Names with dots, and values in which paths are cut down to their last part.
-fn flatten(name: &str, value: &toml::Value, found: &mut Vec<(String, String)>) {
-    match value {
-        toml::Value::Table(table) => {
-            for (key, value) in table {
-                let name = if name.is_empty() { key.clone() } else { format!("{name}.{key}") };
-                flatten(&name, value, found);
-            }
-        }
-        other => found.push((name.to_owned(), plain(other))),
-    }
-}
-
-fn plain(value: &toml::Value) -> String {
-    match value {
-        toml::Value::String(text) if text.contains(['/', '\\']) => {
-            format!("…/{}", text.trim_end_matches(['/', '\\']).rsplit(['/', '\\']).next().unwrap_or_default())
-        }
-        toml::Value::String(text) => text.clone(),
-        toml::Value::Array(values) => {
-            format!("[{}]", values.iter().map(plain).collect::<Vec<_>>().join(", "))
-        }
-        other => other.to_string(),
-    }
+    Some((found.0, found.1, path))
 }

@@ -1,9 +1,10 @@
 //! The part of the page that shows a run's views: errors, warped neighbours, attention, time by op, path, worst samples.
 
-use maud::{Markup, PreEscaped, html};
+use maud::{Markup, html};
 use parallax::report::plot::{Line, Plot};
 use parallax::train::views::{AT_END, Group, Views};
 
+use super::curves::Drawn;
 use super::pictures::Album;
 use super::record::Record;
 
@@ -21,9 +22,6 @@ pub fn views(runs: &[Record], album: &mut Album) -> Markup {
         }
     }
     html! {
-        @if kinds.is_empty() {
-            p.note { "No errors, warped neighbours or attention are recorded: validations of runs of this version leave them." }
-        }
         @for kind in kinds {
             h2 { (kind) }
             @for run in runs {
@@ -72,8 +70,7 @@ pub fn time(runs: &[Record]) -> Markup {
     let known: Vec<(&Record, &Views)> =
         runs.iter().filter_map(|run| Some((run, views_of(run).find(|views| !views.time.is_empty())?))).collect();
     html! {
-        h2 { "Where a step's time goes" }
-        @if known.is_empty() { p.note { "It is not recorded: the first validation of a run of this version measures it." } }
+        @if !known.is_empty() { h2 { "Where a step's time goes" } }
         @for (run, views) in known {
             @let all: f64 = views.time.iter().map(|(_, seconds)| seconds).sum();
             @let rest: f64 = views.time.iter().skip(ROWS).map(|(_, seconds)| seconds).sum();
@@ -98,40 +95,44 @@ pub fn time(runs: &[Record]) -> Markup {
     }
 }
 
-/// The camera's path from above, of all runs in one chart; nothing where none is known.
-pub fn path(runs: &[Record]) -> Markup {
+/// The camera's path from above, of all runs in one chart, beside the true one where that is known; nothing where there is
+/// none.
+pub fn path(runs: &[Record]) -> Option<Drawn> {
     let known: Vec<(&Record, &Views)> =
         runs.iter().filter_map(|run| Some((run, views_of(run).find(|views| views.path.len() > 1)?))).collect();
-    let Some((_, first)) = known.first() else { return html! {} };
+    let (_, first) = known.first()?;
     let unit = if known.iter().all(|(_, views)| views.metres) { "m" } else { "unit of predicted depth" };
-    let line = |(run, views): &(&Record, &Views)| Line {
-        name: run.name.clone(),
-        points: views.path.clone(),
-        marked: views.path.len() < 30,
-    };
+    let line = |name: String, points: &[[f64; 2]]| Line { name, points: points.to_vec(), marked: points.len() < 30 };
+    let mut lines: Vec<Line> = known.iter().map(|(run, views)| line(run.name.clone(), &views.path)).collect();
+    let mut truths: Vec<&[[f64; 2]]> = Vec::new();
+    for (run, views) in &known {
+        if views.true_path.len() > 1 && !truths.contains(&&views.true_path[..]) {
+            let whose = if truths.is_empty() { String::new() } else { format!(" of {}", run.name) };
+            lines.push(line(format!("true path{whose}"), &views.true_path));
+            truths.push(&views.true_path);
+        }
+    }
     let plot = Plot {
         title: "Path of the camera, from above".into(),
         x: format!("right, {unit}"),
         y: format!("forward, {unit}"),
-        lines: known.iter().map(line).collect(),
+        lines,
         equal: true,
         ..Plot::default()
     };
-    let end = first.path[first.path.len() - 1];
+    let ends = |(run, views): &(&Record, &Views)| {
+        let end =
+            |path: &[[f64; 2]]| path.last().map(|[x, z]| format!("{x:.1} to the right and {z:.1} ahead ({unit})"));
+        let truth = end(&views.true_path).map_or_else(String::new, |truth| format!(", truly {truth}"));
+        let off = views
+            .path_error
+            .map_or_else(String::new, |error| format!("; {error:.2} m off on average once laid over the true path"));
+        format!("{} ends {}{truth}{off}", run.name, end(&views.path).unwrap_or_default())
+    };
     let words = format!(
-        "{} frames that were never trained on, as the pose network joins them; {} ends {:.1} to the right and {:.1} ahead ({unit})",
+        "{} frames that were never trained on, as the pose network joins them; {}",
         first.path.len(),
-        known[0].0.name,
-        end[0],
-        end[1],
+        known.iter().map(ends).collect::<Vec<_>>().join(". ")
     );
-    html! {
-        h2 { "Path of the camera" }
-        div.charts {
-            figure {
-                div.scroll role="img" tabindex="0" aria-label={ "Path of the camera from above. " (words) } { (PreEscaped(plot.svg())) }
-                figcaption { (words) }
-            }
-        }
-    }
+    Some(Drawn { title: plot.title.clone(), words, svg: plot.svg() })
 }

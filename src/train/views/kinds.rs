@@ -1,4 +1,4 @@
-//! Views that need the weights and a data set alone: errors, attention, the camera's path.
+//! Views that need the weights and a data set alone: errors, attention.
 
 use super::place::Place;
 use super::{Group, Shown};
@@ -6,14 +6,10 @@ use crate::data::DataSource;
 use crate::data::batch::to_tensor;
 use crate::error::Result;
 use crate::eval::attention::{attention, saliency};
-use crate::eval::odometry::{Odometry, joined};
 use crate::eval::predictor::Predictor;
-use crate::eval::trajectory::Pose;
 use crate::report::map::{draw_map, draw_values};
 use crate::report::overlay::{Overlay, mark};
 
-/// The most frames of the camera's path.
-const PATH: usize = 100;
 /// The error, as a share of the true depth, that is brightest.
 const WORST: f64 = 0.5;
 /// Half the width of the square around a query pixel whose disparity's gradient is shown, in pixels.
@@ -108,21 +104,6 @@ pub(super) fn attention_group(place: &Place, shown: &Shown) -> Result<Option<Gro
     };
     let about = format!("{}: {about}", shown.data.name(0));
     Ok((!views.is_empty()).then(|| Group { kind: format!("{kind} of query pixels"), about, views }))
-}
-
-/// The camera's path over frames that follow one another, from above; empty if there are no such frames at the beginning.
-pub(super) fn path(shown: &Shown, scale: f64) -> Result<Vec<[f64; 2]>> {
-    let data = shown.data;
-    let follows = |&sample: &usize| {
-        let (a, b) = (data.place(sample), data.place(sample + 1));
-        data.recording(sample) == data.recording(sample + 1) && b.sequence == a.sequence && b.frame == a.frame + 1
-    };
-    let count = (0..data.len().saturating_sub(1)).take_while(follows).take(PATH).count();
-    let odometry = Odometry::new(shown.model, shown.params, &shown.setup);
-    let motion = |i: usize| odometry.motion(&*data.image(i, 0)?, &*data.image(i + 1, 0)?);
-    let motions: Vec<Pose> = (0..count).map(motion).collect::<Result<_>>()?;
-    let place = |pose: Pose| [pose.position()[0], pose.position()[2]];
-    Ok(if count == 0 { Vec::new() } else { joined(&motions, scale).into_iter().map(place).collect() })
 }
 
 /// The middle of some numbers.
