@@ -119,8 +119,8 @@ const CAMERA: &str = "Camera (for metres, --ply, --camera-height)";
 const AFTER: &str = "\
 Weights:
   Without --weights, those inside the program. They learnt depth from nothing but streets that this
-  program renders, by watching and from their known depth; the first line of the output says which network they are and what
-  it was trained on. They know a road seen from a car, with houses, trees and parked cars at its
+  program renders, by watching and from their known depth; the first line of the output says which
+  network they are and what it was trained on. They know a road seen from a car, with houses, trees and parked cars at its
   sides. A picture of anything else (a room, a face, a lawn) gets a map all the same: what the
   network makes of it, which may be nonsense. Nothing checks whether a picture shows a street.
 
